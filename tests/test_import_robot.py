@@ -69,6 +69,9 @@ MJCF = (ROBOTS / "hand.xml").read_text()
 """The same hand, but for one actuator."""
 _AXES = ("1 0 0", "0 1 0", "0 0 1")
 _COPIES = '<replicate count="5001"><geom size="0.01"/></replicate></body></worldbody>'
+_PEN = '<body name="pen" pos="0.3 0 0.1"><geom type="capsule" size="0.01 0.05" pos="0 0 0.1"/>'
+_PEN += "".join(f'<joint name="pen{axis}" type="slide" axis="{axis}"/>' for axis in _AXES)
+_PEN += "</body>"
 JAW = (ROBOTS / "jaw.xml").read_text()
 """Two fingers on parallelograms: rods that are pinned to the pads keep these parallel."""
 
@@ -264,6 +267,11 @@ class Toy(Robots):
             self.assertEqual(a.geometry.size, b.geometry.size)
         drives = [(joint.stiffness, joint.effort) for joint in mjcf.joints[:2]]
         self.assertEqual(drives, [(3.0, 2.0), (0.0, 0.0)])
+        unstated, notes = self.read("hand.xml", MJCF.replace('angle="radian" ', ""))
+        self.assertIn("angles are read as radians", notes)
+        for a, b in zip(mjcf.joints, unstated.joints, strict=True):
+            assert_allclose((a.lower, a.upper), (b.lower, b.upper), atol=1e-9)
+            assert_allclose(a.T_parent_joint, b.T_parent_joint, atol=1e-9)
 
     def test_what_mjcf_has_and_robots_do_not_is_named_one_by_one(self):
         ball = MJCF
@@ -390,6 +398,7 @@ class Toy(Robots):
             f'<joint name="b{i}" type="slide" axis="{axis}"/>' for i, axis in enumerate(_AXES)
         ]
         text = MJCF.replace('name="base">', f'name="base">{"".join(slides)}')
+        text = text.replace("</worldbody>", f"{_PEN}</worldbody>")
         exclude = '<contact><exclude body1="f1_a" body2="f2_a"/></contact></mujoco>'
         made = import_robot(
             self.arm,
@@ -403,14 +412,9 @@ class Toy(Robots):
         self.assertIn(("f1_a", "f2_a"), load_robot(made.folder).collision_exclude)
 
     def test_an_object_next_to_the_hand_is_no_part_of_it(self):
-        slides = [
-            f'<joint name="pen{i}" type="slide" axis="{axis}"/>' for i, axis in enumerate(_AXES)
-        ]
-        shape = '<geom type="capsule" size="0.01 0.05" pos="0 0 0.1"/>'
-        pen = f'<body name="pen" pos="0.3 0 0.1">{"".join(slides)}{shape}</body></worldbody>'
         made = import_robot(
             self.arm,
-            self.file("hand.xml", MJCF.replace("</worldbody>", pen)),
+            self.file("hand.xml", MJCF.replace("</worldbody>", f"{_PEN}</worldbody>")),
             self.folder / "mine",
         )
         self.assertRegex(" ".join(made.guessed), "left out: what moves next to the hand: pen")
@@ -485,6 +489,10 @@ class Toy(Robots):
         tree, notes = self.read("shown.urdf", shown)
         self.assertTrue(tree.link("f1_b").collisions)
         self.assertIn("visual shapes collide where there is no other: base, f1_a, f1_b", notes)
+        gone = shown.replace('<box size="0.036 0.014 0.014"/>', '<mesh filename="gone.stl"/>')
+        self.assertRaisesRegex(
+            RobotError, "the mesh 'gone.stl'.* is not", self.read, "x.urdf", gone
+        )
         self.file("tip.stl", "version https://git-lfs.github.com/spec/v1\noid sha256:1\nsize 9")
         stale = "file:///home/somebody/catkin_ws/src/tip.stl"
         pointer = HAND.replace('<box size="0.036 0.014 0.014"/>', f'<mesh filename="{stale}"/>')

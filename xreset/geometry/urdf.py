@@ -398,14 +398,21 @@ def _use_visuals(xml: Element, path: Path) -> None:
     shown_only -= solid
     if shown_only <= carrying:
         return
+    shapes: dict[str, list[tuple[Element, Element]]] = {name: [] for name in shown_only}
     for link, name in zip(links, bodies, strict=True):
-        if name not in shown_only:
-            continue
-        for visual in link.findall("visual"):
+        if name in shown_only:
+            shapes[name] += [(link, visual) for visual in link.iterfind("visual")]
+    for name, found in shapes.items():
+        there = []
+        for link, visual in found:
             mesh = visual.find("geometry/mesh")
             if mesh is None or find_mesh(mesh.get("filename", ""), path):
-                shape = SubElement(link, "collision")
-                shape.extend(part for part in visual if part.tag in ("origin", "geometry"))
+                there.append((link, visual))
+        # the end of a chain needs a shape: without its meshes, reading them says which file is missing
+        needed = found if name not in carrying and not there else there
+        for link, visual in needed:
+            shape = SubElement(link, "collision")
+            shape.extend(part for part in visual if part.tag in ("origin", "geometry"))
 
 
 def _end(joint: Element, end: str) -> str:

@@ -26,13 +26,18 @@ from xreset.spec import Geometry, MimicSpec, Shape
 _COMPILE = """
 import resource, sys
 import mujoco
-source, target, most = sys.argv[1:]
+source, target, most, unit = sys.argv[1:]
 with open("/proc/self/statm") as pages:
     limit = int(pages.read().split()[0]) * resource.getpagesize() + int(most)
 resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
 resource.setrlimit(resource.RLIMIT_CPU, (30, 30))
 try:
-    model = mujoco.MjModel.from_xml_path(source)
+    if unit == "radians":
+        spec = mujoco.MjSpec.from_file(source)
+        spec.compiler.degree = False
+        model = spec.compile()
+    else:
+        model = mujoco.MjModel.from_xml_path(source)
 except ValueError as error:
     print(error)
     sys.exit(1)
@@ -42,6 +47,8 @@ mujoco.MjData(model)
 mujoco.mj_saveModel(model, target)
 """
 """Program that compiles a model in a process whose memory and time are limited: small files can ask for any amount."""
+_RADIANS_AS_DEGREES = np.radians(2 * np.pi)
+"""No hinge of a file that means radians, and leaves it to another file to say so, turns farther [rad]."""
 _LARGEST = 1e10
 """Larger numbers are errors."""
 _PARTS = ("actuator_", "body_", "dof_", "eq_", "geom_", "jnt_", "qpos", "tendon_", "wrap_")
@@ -62,6 +69,12 @@ def read_mjcf(path: Path, notes: list[str]) -> RobotTree:
         RobotError: it cannot be read, or uses what xreset does not have; the message names all of it.
     """
     model = _compiled(path)
+    if 0 < (degrees := _farthest_turn(model)) < _RADIANS_AS_DEGREES:
+        model = _compiled(path, "radians")
+        if _farthest_turn(model) > degrees:
+            notes.append(
+                f"angles are read as radians: as degrees, no joint would turn farther than to {np.degrees(degrees):.3g}"
+            )
     _check_numbers(path, model)
     solid = _solid(model, notes)
     problems = _unsupported(model, solid)
@@ -104,12 +117,27 @@ def _refuse(path: Path, problems: list[str]) -> None:
         )
 
 
-def _compiled(path: Path) -> mujoco.MjModel:
-    """Return the compiled model of a file."""
+def _farthest_turn(model: mujoco.MjModel) -> float:
+    """Return the largest limit of two or more hinges [rad]; 0 if there are fewer."""
+    turns = model.jnt_limited.astype(bool) & (model.jnt_type > SLIDE)
+    return float(np.abs(model.jnt_range[turns]).max()) if turns.sum() > 1 else 0.0
+
+
+def _compiled(path: Path, unit: str = "") -> mujoco.MjModel:
+    """Return the compiled model of a file; unit: ``radians`` if the file's angles are radians, whatever it says."""
     most = max_bytes()
     with tempfile.TemporaryDirectory() as folder:
         binary = f"{folder}/model.mjb"
-        command = [sys.executable, "-P", "-c", _COMPILE, str(path.resolve()), binary, str(most)]
+        command = [
+            sys.executable,
+            "-P",
+            "-c",
+            _COMPILE,
+            str(path.resolve()),
+            binary,
+            str(most),
+            unit,
+        ]
         done = subprocess.run(command, cwd=folder, capture_output=True, text=True, errors="replace")
         if done.returncode == 1 and "alloc" not in done.stdout:
             _refuse_pointers([path.parent / name for name in re.findall("'([^']+)'", done.stdout)])

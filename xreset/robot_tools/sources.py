@@ -153,6 +153,8 @@ def grounded(hand: RobotTree, notes: list[str]) -> RobotTree:
     virtual = []
     while not hand.link(link).collisions:
         joints = [joint for joint in hand.joints if joint.parent == link]
+        if len(joints) > 1:  # frames and loose objects next to the hand
+            joints = [joint for joint in joints if len(_moving_ends(hand, joint.child)) > 1]
         if len(joints) != 1:
             break
         if joints[0].type != "fixed":
@@ -163,6 +165,16 @@ def grounded(hand: RobotTree, notes: list[str]) -> RobotTree:
     names = [joint.name for joint in virtual]
     notes.append(f"left out: joints that only let the hand float: {listed(names)}")
     return with_fixed(hand, names)
+
+
+def _moving_ends(tree: RobotTree, link: str) -> list[str]:
+    """Return the moving links of a link's branch that carry no other moving link."""
+    inside = tree.below(link)
+    return [
+        name
+        for name in inside
+        if name in tree.moved_by and not tree.moved_by.keys() & set(tree.below(name)[1:])
+    ]
 
 
 def with_fixed(tree: RobotTree, names: Sequence[str]) -> RobotTree:

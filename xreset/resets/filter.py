@@ -57,39 +57,17 @@ def stable_states(
     post_contact = retargeted.post_contact[frame]
     object_name = retargeted.object_name[sequence]
     states = State.at_rest(*map(torch.as_tensor, poses))
-    work = len(engines) * len(frame)
-
-    def try_candidates(rows: np.ndarray, report: Progress = unseen) -> np.ndarray:
-        """Return the reasons for which candidates [rows] are rejected, -1 where every engine accepts them."""
-        reason = np.full(len(rows), -1, dtype=np.int64)
-        for number, name in enumerate(engines):
-            left = np.flatnonzero(reason < 0)
-            if not len(left):
-                break
-            before = number * len(rows)
-            reason[left] = probe(
-                name,
-                scene,
-                object_name[rows[left]],
-                states[rows[left]],
-                partial(rejection, limits=limits),
-                gravity=0.0,
-                steps=limits.steps,
-                num_envs=num_envs,
-                device=device,
-                progress=lambda done, before=before: report(before + done, work),
-            )
-        return reason
-
-    reason = try_candidates(np.arange(len(frame)), progress)
+    find = partial(_reasons, engines, scene, limits=limits, num_envs=num_envs, device=device)
+    reason = find(object_name, states, progress=progress)
     if squeeze.presses:
         rows = np.flatnonzero((reason < 0) & post_contact)
         touching = [values[rows] for values in poses]
         fingers = fingers_of(robot, scene.objects, object_name[rows], *touching)
         targets = squeeze_targets(robot, fingers, touching[0], squeeze)
         states.joint_target[rows] = torch.as_tensor(targets, dtype=torch.float32)
-        refused = rows[try_candidates(rows) >= 0]
+        refused = rows[find(object_name[rows], states[rows]) >= 0]
         states.joint_target[refused] = states.joint_pos[refused]
+    work = len(engines) * len(frame)
     progress(work, work)
 
     keep = reason < 0
@@ -116,3 +94,48 @@ def stable_states(
         **kept,
         **rejected,
     )
+
+
+def _reasons(
+    engines: Sequence[str],
+    scene: SceneSpec,
+    object_name: np.ndarray,
+    states: State,
+    *,
+    limits: FilterConfig,
+    num_envs: int,
+    device: str,
+    progress: Progress = unseen,
+) -> np.ndarray:
+    """Return the reasons [M] for which states are rejected, -1 where every engine accepts them.
+
+    Args:
+        engines: names of the engines; each tries the states that those before it accept.
+        scene: robot and objects.
+        object_name: [M] object of each state.
+        states: [M, ...] the states.
+        limits: time and speeds by which states are judged.
+        num_envs: worlds at a time.
+        device: where engines run that can use it.
+        progress: called with (states tried, states to try in all engines).
+    """
+    count = len(object_name)
+    reason = np.full(count, -1, dtype=np.int64)
+    for number, name in enumerate(engines):
+        left = np.flatnonzero(reason < 0)
+        if not len(left):
+            break
+        before = number * count
+        reason[left] = probe(
+            name,
+            scene,
+            object_name[left],
+            states[torch.as_tensor(left)],
+            partial(rejection, limits=limits),
+            gravity=0.0,
+            steps=limits.steps,
+            num_envs=num_envs,
+            device=device,
+            progress=lambda done, before=before: progress(before + done, len(engines) * count),
+        )
+    return reason

@@ -402,9 +402,9 @@ def _with_drives(spec: RobotSpec, tree: RobotTree, notes: list[str]) -> RobotSpe
             kp = float(np.clip(effort / 0.35, 0.5, 10))
             factor = 1.8
         stable = float(f"{_STABLE * inertia / (factor * SceneSpec.timestep) ** 2:.3g}")
-        if joint.group == "hand" and stated.stiffness > max(stable, 10 * kp):
+        if joint.group == "hand" and stated.stiffness > stable:
             softer.append(f"{joint.name} ({stated.stiffness:g})")
-            kp = min(kp, stable)
+            kp = stable if stated.stiffness <= 10 * kp else min(kp, stable)
         elif joint.group == "hand" and stated.stiffness:
             kp = stated.stiffness
         else:
@@ -413,7 +413,7 @@ def _with_drives(spec: RobotSpec, tree: RobotTree, notes: list[str]) -> RobotSpe
         joints.append(replace(joint, drive=replace(joint.drive, kp=kp, kd=kd, effort=effort)))
     if softer:
         notes.append(
-            f"with the stiffness of the rule in place of one too stiff for them: {listed(softer)}"
+            f"with less stiffness than stated, which is too much for the step of the engines: {listed(softer)}"
         )
     notes.append(
         "drives: kd = 1.8 sqrt(kp I) in the hand, critical in the arm, with the inertia I about the joint at home"

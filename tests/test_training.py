@@ -303,10 +303,9 @@ class TrainingTest(WithBank):
         self.assertLess(done, 60)
         self.assertIn("a checkpoint is written", said)
         self.assertTrue((out / "policy.onnx").is_file())
-        words += ["--iterations", str(done + 1)]
-        again = subprocess.run(words, capture_output=True, text=True)
-        self.assertEqual(again.returncode, 0, again.stderr)
-        self.assertIn(f"continuing after iteration {done}\n", again.stdout)
+        with quickly() as again:
+            main([*words[3:], "--iterations", str(done + 1)])
+        self.assertIn(f"continuing after iteration {done}\n", again.getvalue())
         self.assertEqual(newest(out).iteration, done + 1)
 
     def test_a_training_outlives_its_terminal(self):

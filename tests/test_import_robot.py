@@ -466,6 +466,7 @@ class Toy(Robots):
                 "'f1_a' of the hand measures 2 m, expected 0.7",
             ),
             (HAND.replace('upper="1.5"', 'upper="0.02"'), "no joint turns by more than 0.02 rad"),
+            (HAND.replace('"f1_a"', f'"{"x" * 50_000}"'), "^.{,200} has 50000 characters"),
             (
                 HAND.replace('"revolute"', '"continuous"'),
                 "no joint of a finger has limits that say",

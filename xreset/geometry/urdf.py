@@ -45,6 +45,8 @@ _LINK_SIZES = (5e-4, 10.0)
 """[m] Lengths of the shapes of a link; meshes that are smaller or larger are in other units."""
 _FAR = 10.0
 """[m] Largest distance of a joint from its parent link, and of a shape from its link."""
+_LONGEST_NAME = 200
+"""Most characters of the name of a link or joint."""
 _SHORTEST_AXIS = 1e-9
 """Length of a vector that still states a direction."""
 _FOLDERS_ABOVE = 3
@@ -465,8 +467,13 @@ def _ordered(name: str, links: list[Link], joints: list[Joint]) -> RobotTree:
 
 
 def check_tree(tree: RobotTree) -> None:
-    """Raise ``RobotError`` for numbers that are not finite or too large, and for sizes that no robot has; limits of
-    continuous joints may be infinite."""
+    """Raise ``RobotError`` for numbers that are not finite or too large, for sizes that no robot has, and for names
+    that are too long for messages; limits of continuous joints may be infinite."""
+    for part in (*tree.links, *tree.joints):
+        if len(part.name) > _LONGEST_NAME:
+            raise RobotError(
+                f"the name {shown(part.name)} has {len(part.name)} characters, expected {_LONGEST_NAME} at most."
+            )
     for link in tree.links:
         parts = [link.com, link.inertia, link.mass]
         for shape in link.collisions:

@@ -16,10 +16,10 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from xreset import robots
-from xreset.demos.archive import Demos, demo_objects, read_demos
+from xreset.demos.archive import Demos, demo_objects, read_demos, rest_on_table
 from xreset.retarget.hand.config import HandWeights
 from xreset.retarget.hand.model import HandModel
-from xreset.retarget.pipeline import HandMotions, RetargetConfig, rest_on_table
+from xreset.retarget.pipeline import HandMotions, RetargetConfig
 from xreset.spec import ObjectSpec
 
 _CONTACT = 0.020

@@ -18,7 +18,6 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -28,8 +27,8 @@ import numpy as np
 from xreset.backends.mjcf import compile_scene, scene_xml
 from xreset.backends.mjcf_model import MOST_BRAKING, SceneModel, body_name
 from xreset.backends.rigid import mechanism
-from xreset.demos.synth import synthesize
-from xreset.eval.policy_spec import PolicySpec, load_policy
+from xreset.eval.deployed import Deployed, load_deployed
+from xreset.eval.play.session import Session
 from xreset.files.text import short_name
 from xreset.geometry.dynamics import drive_values
 from xreset.geometry.shapes import transformed
@@ -45,13 +44,11 @@ from xreset.pictures.meshes import (
     rgb,
     shade_smoothly,
 )
+from xreset.policy.shipped import shipped_graphs
 from xreset.resets.bank import ResetBank
-from xreset.resets.inputs import load_inputs
 from xreset.spec import ObjectSpec, RobotSpec, SceneSpec
 
 POLICY = "many-objects"
-STARTS = 4
-"""Synthetic demonstrations that each object's starts and goals are from."""
 ROOT = Path(__file__).parents[1]
 SOURCES = ROOT / "docs/try"
 PACKAGES = ROOT / "build/npm"
@@ -209,12 +206,6 @@ def object_part(obj: ObjectSpec, cloud_points: int) -> dict[str, Any]:
     }
 
 
-def with_friction(scene: SceneSpec, friction: Sequence[float]) -> SceneSpec:
-    """Return a scene in which the pairs object-fingertip, object-link and object-table have this friction."""
-    tip, link, table = map(float, friction)
-    return replace(scene, friction=replace(scene.friction, tip=tip, link=link, table=table))
-
-
 def starts_of(bank: ResetBank) -> list[dict[str, Any]]:
     """Return where an object begins, and its goals."""
     rows = []
@@ -229,22 +220,19 @@ def starts_of(bank: ResetBank) -> list[dict[str, Any]]:
     return rows
 
 
-def scene_of(name: str, policy: PolicySpec) -> tuple[SceneSpec, dict[str, Any]]:
+def scene_of(name: str, policy: Deployed) -> tuple[SceneSpec, dict[str, Any]]:
     """Return the scene that ``xreset play`` plays with an object, and the content of its file."""
-    inputs = load_inputs(synthesize([name], STARTS), robot=policy.robot, only=[name])
-    with policy.make_env(inputs.objects, inputs.bank) as env:
-        friction = env.variation.parameters["friction"][0].tolist()
-        scene = with_friction(env.backend.scene, friction)
-    content = physics_part(scene, 0)
-    points = policy.task.observation.cloud_points
-    content["object"] = object_part(inputs.objects[0], points)
-    content["starts"] = starts_of(inputs.bank)
-    return scene, content
+    session = Session(policy, object_name=name)
+    session.close()
+    content = physics_part(session.scene, 0)
+    content["object"] = object_part(session.scene.objects[0], len(session.cloud()))
+    content["starts"] = starts_of(session.bank)
+    return session.scene, content
 
 
 def write_data(folder: Path, names: Sequence[str]) -> None:
     """Write the robot and the objects of these names."""
-    policy = load_policy(POLICY)
+    policy = load_deployed(POLICY)
     scenes = folder / "scenes"
     scenes.mkdir(parents=True, exist_ok=True)
     for name in names:
@@ -267,7 +255,7 @@ def write_data(folder: Path, names: Sequence[str]) -> None:
 
 def write_policy(folder: Path) -> None:
     """Write the policy as one graph from readings to joint targets."""
-    (folder / "policy.onnx").write_bytes(load_policy(POLICY).graph)
+    shutil.copy(shipped_graphs()[POLICY], folder / "policy.onnx")
 
 
 def build(folder: Path, names: Sequence[str]) -> None:

@@ -18,19 +18,19 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import field, fields
 from math import isnan
-from typing import Any, Literal, Self
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from xreset.files.checks import NonNegativeFloat, NonNegativeInt, Share, frozen
-from xreset.geometry.rotations import quat_angle
 from xreset.objects.sampling import Frame, keypoints, metric_points
 from xreset.physics.tensors import Tensors
 from xreset.spec import ObjectSpec
-from xreset.task.reading import Reading
-from xreset.task.rewards import CONTACT_FORCE, contact_gate, point_distances
+
+if TYPE_CHECKING:  # functions import torch, so that results are read without it
+    from torch import Tensor
+
+    from xreset.task.reading import Reading
 
 STAGE_SCORES = (0.0, 0.33, 0.66, 1.0)
 """Task progress if the highest stage is: none, approach, grasp, reorientation."""
@@ -142,6 +142,8 @@ class MetricPoints(Tensors):
     def of(cls, objects: Sequence[ObjectSpec], frame: Frame = "mesh") -> Self:
         """Return the points of some objects; ``frame``: the task's ``object_frame``."""
 
+        import torch
+
         def stacked(points: list[np.ndarray]) -> Tensor:
             return torch.as_tensor(np.stack(points), dtype=torch.float32)
 
@@ -165,6 +167,10 @@ class EpisodeMetrics:
             goal_quat: [N, 4] goal of its orientation.
             points: points of each world's object.
         """
+        import torch
+
+        from xreset.geometry.rotations import quat_angle
+
         self._points = points
         self._goal_pos = goal_pos.clone()
         self._goal_quat = goal_quat.clone()
@@ -224,11 +230,18 @@ class EpisodeMetrics:
     @property
     def task_progress(self) -> Tensor:
         """[N] score of the highest stage, one of :data:`STAGE_SCORES`."""
+        import torch
+
         stage = torch.where(self.reorient, 3, torch.where(self.grasp, 2, self.approach.long()))
         return torch.tensor(STAGE_SCORES, device=stage.device)[stage]
 
     def _add(self, reading: Reading) -> None:
         """Update the metrics of the worlds that have not ended."""
+        import torch
+
+        from xreset.geometry.rotations import quat_angle
+        from xreset.task.rewards import CONTACT_FORCE, contact_gate
+
         state = reading.task_state
         live = ~self._ended
         self.approach |= live & (reading.tip_distance.amin(dim=-1) <= APPROACH_DISTANCE)
@@ -252,6 +265,8 @@ class EpisodeMetrics:
 
     def _distances(self, reading: Reading, points: Tensor) -> Tensor:
         """[N, P] distances of the objects' points [N, P, 3] from the same points at the goal [m]."""
+        from xreset.task.rewards import point_distances
+
         state = reading.task_state
         return point_distances(
             state.object_pos, state.object_quat, self._goal_pos, self._goal_quat, points

@@ -14,16 +14,16 @@ from torch import Tensor
 
 from xreset.env.manipulation import ManipulationEnv, make_env
 from xreset.errors import PolicyError
+from xreset.eval.deployed import deployed, played_objects
 from xreset.files.checks import Checked, Seed, frozen, obeys_rules
 from xreset.files.text import Brief, shown
 from xreset.geometry.description import load_robot
 from xreset.learning.exported import read_policy
 from xreset.learning.run import read_run
-from xreset.live.deploy import deployed_graph, is_deployed, task_of
+from xreset.live.deploy import deployed_graph, is_deployed, made_for, task_of
 from xreset.live.engine import GraphPolicy
-from xreset.objects.catalogue import object_names
 from xreset.policy.onnx_policy import OnnxPolicy, Policy, RandomPolicy, ZeroPolicy, check_contract
-from xreset.policy.shipped import results_folder
+from xreset.policy.shipped import graph_of, results_folder
 from xreset.resets.bank import ResetBank
 from xreset.retarget.file import Retargeted
 from xreset.runtime import Controller
@@ -88,8 +88,7 @@ class PolicySpec(Brief, Checked):
         Args:
             folder: folder of meshes; None: the stand-ins.
         """
-        names = object_names(folder)
-        return tuple(name for name in names if name in (self.objects or ())) or names
+        return played_objects(self.objects or (), folder)
 
     @obeys_rules
     def make_env(
@@ -151,19 +150,19 @@ class PolicySpec(Brief, Checked):
 
     @cached_property
     def graph(self) -> bytes:
-        """Content of the deployed policy, from readings to joint targets; its contract lists no objects.
+        """Content of the deployed policy, from readings to joint targets. Its contract lists no objects, unless the
+        policy was loaded as a graph.
 
         Raises:
             PolicyError: a baseline, a policy with cameras, or one that observes something that no robot measures.
         """
-        return self.deployed(())
-
-    def deployed(self, objects: Sequence[ObjectSpec]) -> bytes:
-        """Return :attr:`graph`, whose contract lists these objects, unless the policy was loaded as a graph."""
         content = self.exported()
         if is_deployed(content):
             return content
-        return deployed_graph(content, self.robot, self.task, objects)
+        graph = graph_of(content)
+        if graph is not None and made_for(graph, self.robot):
+            return graph
+        return deployed_graph(content, self.robot, self.task)
 
 
 def load_policy(
@@ -240,21 +239,14 @@ def _deployed(file: Path, robot: str | Path | None) -> PolicySpec:
     """Return a policy whose file is a graph from readings to joint targets, whoever trained it."""
     content = file.read_bytes()
     controller = Controller(content, str(file))
-    contract = controller.contract
-    spec = load_robot(robot or contract["robot"])
-    names = tuple(joint["name"] for joint in contract["joints"])
-    if names != spec.joint_names:
-        raise PolicyError(
-            f"{file} has the joints {', '.join(names)}, but the robot {spec.name!r} has {', '.join(spec.joint_names)}."
-        )
-    name = file.parent.resolve().name if file.name == POLICY else file.stem
+    found = deployed(file, robot)
     return PolicySpec(
-        name=name,
+        name=found.name,
         start=lambda motion: GraphPolicy(Controller(content, str(file))),
-        robot=spec,
+        robot=found.robot,
         task=task_of(controller, str(file)),
         folder=file.parent / "eval",
-        objects=tuple(contract.get("objects", ())),
+        objects=tuple(controller.contract.get("objects", ())),
         hash=sha256(content).hexdigest(),
         content=content,
     )

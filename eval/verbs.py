@@ -282,10 +282,11 @@ def export_deploy(
     robot: str | Path | None = None,
     meshes: str | Path | None = None,
     only: Annotated[Sequence[str], Option("object")] = (),
-) -> PolicySpec:
+) -> Path:
     """Write a policy for a robot: one ONNX graph from readings to joint targets, and a runtime.
 
-    The runtime needs Python, numpy and onnxruntime (docs/live.md).
+    The runtime needs Python, numpy and onnxruntime (docs/live.md). The graph of a run is exported from torch's code;
+    those of policies that ship with xreset are there.
 
     Args:
         policy: run folder, one of its checkpoints (.pt), exported policy (.onnx), or name of a policy that ships with
@@ -296,20 +297,21 @@ def export_deploy(
         only: object whose points the contract lists, or several; default: the objects of the training.
 
     Returns:
-        The policy.
+        The folder.
 
     Raises:
         PolicyError: the policy is a baseline or looks through cameras, or the folder is not empty.
         ObjectError: there is neither a stand-in nor a mesh of an object.
     """
-    from xreset.eval.policy_spec import load_policy
+    from xreset.eval.deployed import load_deployed, played_objects
     from xreset.live.deploy import write_deployed
     from xreset.objects.catalogue import load_objects
 
-    spec = load_policy(policy, robot=robot)
-    folder = spec.meshes_folder(meshes)
-    write_deployed(spec.deployed(load_objects(only or spec.objects_of(folder), folder)), Path(out))
-    return spec
+    found = load_deployed(policy, robot)
+    folder = Path(meshes) if meshes else found.meshes
+    listed = load_objects(only or played_objects(found.objects, folder), folder)
+    write_deployed(found.listing(listed), Path(out))
+    return Path(out)
 
 
 @obeys_rules

@@ -39,6 +39,7 @@ from xreset import (
     synthesize,
 )
 from xreset.errors import PolicyError
+from xreset.eval.deployed import load_deployed
 from xreset.eval.rollout import engine, episode_starts, load_trial, roll_out
 from xreset.live import cache
 from xreset.live.deploy import deployed_graph, write_deployed
@@ -170,7 +171,8 @@ class ToyTest(InFolder):
         onnx.checker.check_model(model)
         self.assertEqual({node.domain for node in model.graph.node}, {""})
         self.assertEqual(
-            [value.name for value in model.graph.output], ["target", "memory_out", "links"]
+            [value.name for value in model.graph.output],
+            ["target", "memory_out", "links", "observations"],
         )
         shapes = self.controller.shapes
         self.assertNotIn("object_center", shapes, "the draft's observations do not need it")
@@ -330,7 +332,7 @@ class ToyTest(InFolder):
         (old / "policy.onnx").write_bytes(self.network.read_bytes())
         spec = load_policy(old, robot=self.robot)
         self.assertIsInstance(spec.start(None), OnnxPolicy)
-        contract = Controller(spec.deployed([toy_grasp.brick()])).contract
+        contract = Controller(load_deployed(spec).listing([toy_grasp.brick()])).contract
         self.assertEqual(contract, self.contract)
 
     def test_the_example_of_a_driver(self):

@@ -174,9 +174,10 @@ class PageTest(TestCase):
         assert version
         self.assertIn(f"\nversion: {version[1]}\n", (ROOT / "CITATION.cff").read_text())
 
-    def test_what_an_environment_imports_is_installed_without_extras(self):
+    def test_what_an_environment_imports_is_installed_with_the_extra_torch(self):
         project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-        names = {re.split(r"\W", text)[0] for text in project["dependencies"]}
+        installed = project["dependencies"] + project["optional-dependencies"]["torch"]
+        names = {re.split(r"\W", text)[0] for text in installed}
         imported = set()
         for node in ast.walk(ast.parse((ROOT / "xreset/env/manipulation.py").read_text())):
             if isinstance(node, ast.Import):

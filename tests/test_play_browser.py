@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 
 from tests.browser import Browser, find_chromium, wait_until
 from xreset.eval.play.session import Session
-from xreset.physics.tensors import one_thread
 
 
 @unittest.skipUnless(find_spec("viser"), "viser is not installed")
@@ -19,7 +18,6 @@ class InTheBrowser(unittest.TestCase):
     def setUpClass(cls):
         from xreset.eval.play.page import Page
 
-        cls.enterClassContext(one_thread())
         cls.browser = Browser(find_chromium())
         cls.addClassCleanup(cls.browser.close)
         cls.session = Session("nine-objects")
@@ -29,7 +27,7 @@ class InTheBrowser(unittest.TestCase):
         cls.addClassCleanup(cls.page.close)
 
     def setUp(self):
-        self.session.env.generator.manual_seed(0)
+        self.session.random = np.random.default_rng(0)
         self.session.begin()
         self.browser.problems.clear()
         self.browser.resize(1000, 500)  # wide, because the controls cover 320 pixels on the right

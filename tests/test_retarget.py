@@ -16,7 +16,7 @@ from tests.data import InOneFolder, data_dir
 from tests.toy_retarget import FLOAT, arm_targets, box_object, check_gradient, double, hand_targets
 from tests.toy_robot import toy_motion, toy_robot
 from xreset import read_retargeted, robots, synthesize, write_retargeted
-from xreset.demos.archive import demo_objects, read_demos, write_demos
+from xreset.demos.archive import demo_objects, read_demos, rest_on_table, write_demos
 from xreset.errors import DemoError, FileFormatError, RobotError, XResetError
 from xreset.files.records import arrays_of, stated_doubts, write_npz
 from xreset.geometry.collision import table_clearance
@@ -35,7 +35,7 @@ from xreset.retarget.hand.cost import system
 from xreset.retarget.hand.model import HandModel, keypoint_pairs
 from xreset.retarget.hand.solve import retarget_hand
 from xreset.retarget.least_squares import solve_chain
-from xreset.retarget.pipeline import RetargetConfig, rest_on_table
+from xreset.retarget.pipeline import RetargetConfig
 from xreset.retarget.validity import REASONS, Measures, Thresholds, classify, too_deep
 from xreset.retarget.verbs import retarget_demos
 from xreset.spec import KEYPOINTS

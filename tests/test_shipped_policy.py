@@ -7,10 +7,15 @@ import tempfile
 import unittest
 from importlib.util import find_spec
 
+import numpy as np
+from numpy.testing import assert_allclose
+
 from xreset import OnnxPolicy, evaluate, synthesize
 from xreset.eval.policy_spec import BASELINES, load_policy
+from xreset.live.deploy import deployed_graph
 from xreset.objects.catalogue import object_names
-from xreset.policy.shipped import card, shipped
+from xreset.policy.shipped import card, shipped, shipped_graphs
+from xreset.runtime import Controller, Reading
 
 LARGEST = 5e6
 """What a policy may add to every download [bytes]."""
@@ -29,6 +34,28 @@ for file in sys.argv[2:]:
     actions = policy.act({group: torch.zeros(3, *shape) for group, shape in shapes.items()})
     print(json.dumps([list(actions.shape), bool(actions.isfinite().all())]))
 """
+
+
+def step_at_random(controller):
+    """Take three steps with the same readings for every controller."""
+    random = np.random.default_rng(0)
+    home = np.array([joint["home"] for joint in controller.contract["joints"]])
+    tips = len(controller.contract["fingertips"])
+    points = 0.05 * random.standard_normal(controller.shapes["object_points"])
+    upright = (1.0, 0.0, 0.0, 0.0)
+    controller.begin(points, (0.5, 0.3, 0.2), upright, home, (0.0, 0.0, 0.01))
+    for _ in range(3):
+        turned = random.standard_normal(4)
+        reading = Reading(
+            joint_pos=home + 0.05 * random.standard_normal(len(home)),
+            joint_vel=random.standard_normal(len(home)),
+            joint_time=0.0,
+            object_pos=0.3 + 0.1 * random.standard_normal(3),
+            object_quat=turned / np.linalg.norm(turned),
+            object_time=0.0,
+            tip_force=random.standard_normal((tips, 3)),
+        )
+        controller.step(reading)
 
 
 class ShippedPolicyTest(unittest.TestCase):
@@ -60,6 +87,24 @@ class ShippedPolicyTest(unittest.TestCase):
                 self.assertEqual(set(spec.objects_of(None)), trained & set(object_names()))
 
     @unittest.skipUnless(find_spec("mujoco"), "mujoco is not installed")
+    @unittest.skipUnless(find_spec("onnxscript"), "onnxscript is not installed")
+    def test_its_graph_is_what_this_version_would_export(self):
+        without_graph = set(shipped())
+        for name, file in shipped_graphs().items():
+            with self.subTest(name):
+                spec = load_policy(name)
+                self.assertEqual(spec.graph, file.read_bytes())
+                without_graph.remove(name)
+                shipped_one = Controller(spec.graph)
+                fresh = Controller(deployed_graph(spec.exported(), spec.robot, spec.task))
+                self.assertEqual(shipped_one.contract["joints"], fresh.contract["joints"])
+                for controller in (shipped_one, fresh):
+                    step_at_random(controller)
+                assert_allclose(shipped_one.target, fresh.target, rtol=0, atol=1e-6)
+                assert_allclose(shipped_one.observations, fresh.observations, rtol=0, atol=1e-5)
+        for name in without_graph:
+            self.assertTrue(load_policy(name).task.vision.cameras, name)
+
     def test_it_still_grasps_and_lifts(self):
         for name, file in shipped().items():
             with self.subTest(name):

@@ -18,6 +18,7 @@ from xreset.backends.mjcf import compile_scene
 from xreset.eval.play.session import Session
 from xreset.geometry.description import load_robot
 from xreset.objects.catalogue import load_object
+from xreset.physics import State
 from xreset.physics.tensors import one_thread
 from xreset.spec import SceneSpec
 
@@ -42,17 +43,15 @@ class PhysicsTest(unittest.TestCase):
         """
         session = Session("many-objects", object_name=name)
         self.addCleanup(session.close)
-        env = session.env
-        start = env.backend.state().clone()
-        high = start.object_pos[0].numpy() + np.array((0.0, 0.0, 0.2))
-        session.move_goal(high, start.object_quat[0].numpy())
+        start = session.world.state
+        high = start["object_pos"] + np.array((0.0, 0.0, 0.2))
+        session.move_goal(high, start["object_quat"])
         moments = [session.step() for _ in range(STEPS)]
         lift = moments[-1].object_pos[2] - moments[0].object_pos[2]
         self.assertGreater(lift, 0.02, "the object was not lifted")
-        backend = WasmBackend(env.backend.scene, 1, workers=0)
+        backend = WasmBackend(session.scene, 1, workers=0)
         self.addCleanup(backend.close)
-        backend.set_friction(env.variation.parameters["friction"])
-        backend.set_state(start)
+        backend.set_state(State(**{name: torch.tensor(x)[None] for name, x in start.items()}))
         rows = []
         for moment in moments:
             backend.set_joint_targets(torch.as_tensor(moment.joint_target)[None])
@@ -100,26 +99,24 @@ class PolicyTest(unittest.TestCase):
         self.enterContext(one_thread())
         session = Session("many-objects", object_name=CAN)
         self.addCleanup(session.close)
-        env = session.env
         folder = Path(self.enterContext(TemporaryDirectory()))
         try_page.write_policy(folder)
-        obj = env.backend.scene.objects[0]
+        obj = session.scene.objects[0]
         ask(do="load", folder=str(folder), object=try_page.object_part(obj, 64))
         for _ in range(45):
-            reading = env.reading()
-            state = reading.state
+            state = session.world.state
             target = ask(
                 do="act",
                 reading={
-                    "jointPos": state.joint_pos[0].tolist(),
-                    "jointVel": state.joint_vel[0].tolist(),
-                    "objectPos": state.object_pos[0].tolist(),
-                    "objectQuat": state.object_quat[0].tolist(),
-                    "tipForce": reading.contacts.tip_force.flatten().tolist(),
+                    "jointPos": state["joint_pos"].tolist(),
+                    "jointVel": state["joint_vel"].tolist(),
+                    "objectPos": state["object_pos"].tolist(),
+                    "objectQuat": state["object_quat"].tolist(),
+                    "tipForce": session.world.tip_force.ravel().tolist(),
                 },
-                target=env.joint_target[0].tolist(),
-                goalPos=env.goal_pos[0].tolist(),
-                goalQuat=env.goal_quat[0].tolist(),
+                target=session.target.tolist(),
+                goalPos=session.goal_pos.tolist(),
+                goalQuat=session.goal_quat.tolist(),
             )
             moment = session.step()
             np.testing.assert_allclose(target, moment.joint_target, rtol=0, atol=1e-5)

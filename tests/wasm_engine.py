@@ -10,6 +10,7 @@ import atexit
 import json
 import shutil
 import subprocess
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -52,6 +53,12 @@ def ask(**command):
     answer = node.stdout.readline()
     assert answer, "Node has stopped: its message is above"
     return json.loads(answer)
+
+
+def with_friction(scene, friction):
+    """Return a scene in which the pairs object-fingertip, object-link and object-table have this friction."""
+    tip, link, table = map(float, friction)
+    return replace(scene, friction=replace(scene.friction, tip=tip, link=link, table=table))
 
 
 class WasmWorld(World):
@@ -110,7 +117,7 @@ class WasmWorld(World):
         assert np.isclose(inertia.mass, nominal), "the page has nominal masses"
 
     def set_friction(self, friction):
-        scene = try_page.with_friction(self._scene, friction)
+        scene = with_friction(self._scene, friction)
         part = try_page.physics_part(scene, self._object_index)
         self.number = ask(do="build", scene=part, instead=self.number)
 

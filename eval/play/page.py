@@ -11,18 +11,17 @@ from functools import partial
 from math import degrees
 from pathlib import Path
 from queue import Empty, SimpleQueue
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from xreset.errors import XResetError
+from xreset.eval.deployed import RESTS, Deployed
 from xreset.eval.play.record import draw_film, last_moments, write_trace
 from xreset.eval.play.session import Session
 from xreset.eval.plots import COLORS
-from xreset.eval.policy_spec import PolicySpec
 from xreset.files.text import short_name
 from xreset.physics.plugins import backend_names, robot_names
-from xreset.physics.tensors import one_thread
 from xreset.pictures.meshes import GOAL_COLOR, OBJECT_COLOR, rgb
 from xreset.pictures.view.colors import TOUCH_COLOR
 from xreset.pictures.view.server import (
@@ -33,11 +32,12 @@ from xreset.pictures.view.server import (
     chosen,
     serve_until_interrupted,
 )
-from xreset.policy.shipped import shipped
+from xreset.policy.shipped import shipped_graphs
+
+if TYPE_CHECKING:
+    from xreset.eval.policy_spec import PolicySpec
 
 HELP = "Drag the **green shape**, and the robot brings the object there. Pull at the object or the robot to disturb it."
-NOBODY = "zero"
-"""The policy of a robot that no policy was trained for: it rests."""
 PHONE_STYLE = """<style>@media (max-width: 36em) {
 [style*="width: 20em"] {width: 100% !important} [style*="max-height: 60%"] {max-height: 42% !important}
 }</style>"""
@@ -61,17 +61,18 @@ GROWTH = 1.03
 """Size of the goal next to the object, so that a pointer meets the goal first where both are in one place."""
 
 
-def serve(policy: str | Path | PolicySpec, *, host: str, port: int, **options: Any) -> None:
+def serve(
+    policy: str | Path | Deployed | PolicySpec, *, host: str, port: int, **options: Any
+) -> None:
     """Serve a live episode until Ctrl-C; ``options`` are those of :class:`~xreset.eval.play.session.Session`."""
     print("Loading the policy, the object and the engine ...", flush=True)
-    with one_thread():
-        session = Session(policy, **options)
-        try:
-            page = Page(session, host=host, port=port)
-            print(f"{session.policy.name} plays at {page.url}. Ctrl-C ends.", flush=True)
-            serve_until_interrupted(page)
-        finally:
-            session.close()
+    session = Session(policy, **options)
+    try:
+        page = Page(session, host=host, port=port)
+        print(f"{session.policy.name} plays at {page.url}. Ctrl-C ends.", flush=True)
+        serve_until_interrupted(page)
+    finally:
+        session.close()
 
 
 class Page(WebPage):
@@ -195,7 +196,7 @@ class Page(WebPage):
             drawn.remove()
         session = self.session
         scene = self._server.scene
-        obj = session.env.backend.scene.objects[0]
+        obj = session.scene.objects[0]
         radius = float(np.ptp(obj.vertices, axis=0).max()) / 2
         middle = (obj.vertices.max(axis=0) + obj.vertices.min(axis=0)) / 2
         self._body = scene.add_mesh_simple(
@@ -271,15 +272,14 @@ class Page(WebPage):
     def _draw(self) -> None:
         """Show the present state."""
         session = self.session
-        env = session.env
-        state = env.backend.state()
+        state = session.world.state
         with self._server.atomic():
-            self._robot.place(state.joint_pos[0].numpy())
-            self._body.position = state.object_pos[0].numpy()
-            self._body.wxyz = state.object_quat[0].numpy()
+            self._robot.place(state["joint_pos"])
+            self._body.position = state["object_pos"]
+            self._body.wxyz = state["object_quat"]
             self._body.visible = not session.away
-            self._goal.position = env.goal_pos[0].numpy()
-            self._goal.wxyz = env.goal_quat[0].numpy()
+            self._goal.position = session.goal_pos
+            self._goal.wxyz = session.goal_quat
             self._handle.position = self._goal.position + self._beside
             if not self._turning:
                 self._rings.position = self._goal.position
@@ -311,8 +311,8 @@ class Page(WebPage):
         self._engine = gui.add_dropdown("engine", backend_names())
         self._policies = {
             self.session.policy.name: self.session.policy,
-            **{name: name for name in shipped()},
-            NOBODY: NOBODY,
+            **{name: name for name in shipped_graphs()},
+            RESTS: RESTS,
         }
         with gui.add_folder("robot and policy", expand_by_default=False):
             self._policy = gui.add_dropdown("policy", tuple(self._policies))
@@ -321,10 +321,9 @@ class Page(WebPage):
         with gui.add_folder("curves", expand_by_default=False) as folder:
             self._see = gui.add_checkbox("the object's points that the policy sees", False, order=0)
             self._see.on_update(lambda _: setattr(self._points, "visible", self._see.value))
-            self._input = gui.add_dropdown("input", tuple(self.session.inputs), order=3)
+            self._input = gui.add_dropdown("input", tuple(self.session.inputs) or ("",), order=2)
             self._forces = _Curves(gui, folder, "fingertip forces [N]", 1)
-            self._rewards = _Curves(gui, folder, "terms of the reward", 2)
-            self._inputs = _Curves(gui, folder, "this input of the policy", 4, legend=False)
+            self._inputs = _Curves(gui, folder, "this input of the policy", 3, legend=False)
         with gui.add_folder("save", expand_by_default=False):
             self._seconds = gui.add_slider("seconds", 2, 60, 1, 10)
             film = gui.add_button("Film (mp4)")
@@ -344,7 +343,7 @@ class Page(WebPage):
         self._engine.value = session.engine
         self._policy.value = session.policy.name
         self._robot_name.value = session.policy.robot.name
-        inputs = tuple(session.inputs)
+        inputs = tuple(session.inputs) or ("",)
         if self._input.options != inputs:
             self._input.options = inputs
 
@@ -371,12 +370,12 @@ class Page(WebPage):
         engine = chosen(self._engine, session.engine)
         object_name = self._names.get(self._object.value, session.object_name)
         if robot != session.policy.robot.name:
-            choice = partial(session.choose_policy, NOBODY, robot=robot)
+            choice = partial(session.choose_policy, RESTS, robot=robot)
         elif policy != session.policy.name:
             choice = partial(
                 session.choose_policy,
                 self._policies[policy],
-                robot=robot if policy == NOBODY else None,
+                robot=robot if policy == RESTS else None,
             )
         elif object_name != session.object_name:
             choice = partial(session.choose_object, object_name)
@@ -409,8 +408,8 @@ class Page(WebPage):
         times = np.array([moment.time for moment in moments])
         forces = np.array([np.linalg.norm(moment.tip_force, axis=1) for moment in moments])
         self._forces.show(times, forces, session.policy.robot.fingertip_names)
-        rewards = np.array([moment.reward for moment in moments])
-        self._rewards.show(times, rewards, session.terms)
+        if not session.inputs:
+            return
         name = chosen(self._input, self._input.options[0])
         shown = session.inputs[name]
         inputs = np.array([moment.inputs[shown] for moment in moments])
@@ -445,7 +444,7 @@ class Page(WebPage):
         note = client.add_notification(
             "Drawing the film", "It takes a while. Go on playing.", loading=True
         )
-        film = self._films.submit(draw_film, self.session.env.backend.scene, moments)
+        film = self._films.submit(draw_film, self.session.scene, moments)
 
         def send(done: Any) -> None:
             note.remove()

@@ -24,7 +24,7 @@ def write_trace(path: str | Path, session: Session) -> None:
 
     Its goal is the last one. Next to the arrays of every recorded episode, ``goal_path_pos`` [T, 3] and
     ``goal_path_quat`` [T, 4] say where the goal was, and the other fields of
-    :class:`~xreset.eval.play.session.Moment` are arrays [T, ...]. ``reward`` [T, R] has the names ``reward_names`` [R].
+    :class:`~xreset.eval.play.session.Moment` are arrays [T, ...].
     The columns of ``inputs`` [T, D] have the names ``input_names`` [D].
 
     Raises:
@@ -59,7 +59,6 @@ def write_trace(path: str | Path, session: Session) -> None:
         policy=session.policy.name,
         robot=robot.name,
         fingertip_names=np.array(robot.fingertip_names),
-        reward_names=np.array(session.terms),
         input_names=np.array(input_names),
         goal_path_pos=goal_pos,
         goal_path_quat=goal_quat,
@@ -69,7 +68,7 @@ def write_trace(path: str | Path, session: Session) -> None:
 
 def write_film(path: str | Path, session: Session, *, seconds: float = 10.0) -> None:
     """Write the last seconds of a session as an mp4 at its own speed; ``XResetError`` if nothing has happened yet."""
-    write_whole(Path(path), draw_film(session.env.backend.scene, last_moments(session, seconds)))
+    write_whole(Path(path), draw_film(session.scene, last_moments(session, seconds)))
 
 
 def draw_film(scene: SceneSpec, moments: Sequence[Moment]) -> bytes:

@@ -1,5 +1,6 @@
 """A live episode: one robot, one object and one goal that a user moves while the policy acts.
 
+The policy is its deployed graph, as on a robot, and the world is one of an engine in numpy: torch is not needed.
 Shape letters: J joints, E fingertips, D numbers that the policy observes.
 """
 
@@ -7,36 +8,43 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 from numpy.typing import ArrayLike
-from torch import Tensor
 
+from xreset.backends.single import SingleWorld
 from xreset.demos.synth import synthesize
-from xreset.env.manipulation import ManipulationEnv
 from xreset.errors import XResetError
-from xreset.eval.policy_spec import PolicySpec, load_policy
+from xreset.eval.deployed import Deployed, load_deployed, observation_names
+from xreset.eval.metrics import GOAL_ANGLE, GOAL_DISTANCE
 from xreset.files.checks import frozen
 from xreset.geometry.dynamics import drive_values
-from xreset.geometry.kinematics import Kinematics
-from xreset.geometry.rotations import quat_angle, quat_rotate, quat_rotate_inverse
-from xreset.live.engine import GraphPolicy
+from xreset.geometry.kinematics import on_host
+from xreset.geometry.shapes import turn_of
+from xreset.geometry.urdf import joint_limits
+from xreset.live.deploy import task_of
 from xreset.objects.catalogue import ALIASES, canonical_name, object_names
 from xreset.objects.rest import rest_height
-from xreset.physics import State
-from xreset.policy.onnx_policy import Policy
-from xreset.resets.inputs import Inputs, load_inputs
-from xreset.spec import GRAVITY
-from xreset.task.observations import layout
+from xreset.objects.sampling import center, surface_points
+from xreset.resets.bank import ResetBank
+from xreset.resets.inputs import load_inputs
+from xreset.runtime import Controller, Reading
+from xreset.spec import GRAVITY, ObjectSpec, PairFriction, RobotSpec, SceneSpec
+from xreset.task.config import TaskConfig, evaluation_task
 from xreset.task.terminations import out_of_bounds
+
+if TYPE_CHECKING:
+    from xreset.eval.policy_spec import PolicySpec
 
 KEPT_SECONDS = 60.0
 """How much of the past a session keeps, for curves, films and traces [s]."""
 STARTS = 8
 """Synthetic demonstrations that starts and goals are drawn from."""
+LEAST_FRICTION = 0.05
+"""Least friction of a pair that touches the object."""
 GOAL_HEIGHT = 0.6
 """Highest goal above the table [m]."""
 PULL_RATE = 10.0
@@ -66,25 +74,21 @@ class Moment:
     """[J] rad (m)"""
     joint_vel: np.ndarray
     joint_target: np.ndarray
-    """[J] targets of the drives."""
+    """[J] targets of the drives, without a pull at the robot."""
     object_pos: np.ndarray
     object_quat: np.ndarray
     goal_pos: np.ndarray
     goal_quat: np.ndarray
     tip_force: np.ndarray
     """[E, 3] force of each fingertip on the object [N]."""
-    action: np.ndarray
-    """[J] in [-1, 1]."""
     inputs: np.ndarray
-    """[D] what the policy observed before it acted, without the point cloud: see :attr:`Session.inputs`."""
-    reward: np.ndarray
-    """Weighted terms, in the order of :attr:`Session.terms`."""
+    """[D] what the policy observed before it acted, without the object's points: see :attr:`Session.inputs`."""
     distance: float
     """From the object to its goal [m]."""
     angle: float
     """From the object's orientation to the goal's [rad]."""
     success: bool
-    """Whether the object is held at its goal."""
+    """Whether the object is at its goal, as at the end of an evaluation."""
 
 
 @dataclass(kw_only=True)
@@ -93,32 +97,35 @@ class _Pull:
 
     link: str | None
     """Link of the robot; None: the object."""
-    point: Tensor
+    point: np.ndarray
     """[3] in the frame of the link or object."""
-    to: Tensor
+    to: np.ndarray
     """[3] world."""
 
 
 class Session:
     """A live episode. Nothing ends it: the time limit and the bounds of the training do not hold.
 
-    A session belongs to one thread. Its engine runs on the CPU.
+    A session belongs to one thread.
 
     Attributes:
         policy: the policy that acts.
-        engine: name of the engine.
-        env: one world, which has the policy's own task.
+        world: the robot and the object in an engine.
+        scene: what the world was built from.
+        goal_pos: [3] goal of the object's mesh frame [m].
+        goal_quat: [4]
         time: seconds since the session's begin.
         history: the last :data:`KEPT_SECONDS` of this object and robot, oldest first.
         away: whether the object is taken away.
         inputs: name of each part of what the policy observes, and its place in :attr:`Moment.inputs`.
-        terms: names of the reward's terms; empty before the first step.
         objects: names of the objects to choose from.
+        bank: starts and goals.
+        random: source of starts and goals.
     """
 
     def __init__(
         self,
-        policy: str | Path | PolicySpec = "many-objects",
+        policy: str | Path | Deployed | PolicySpec = "many-objects",
         *,
         object_name: str | None = None,
         engine: str = "mujoco",
@@ -130,7 +137,7 @@ class Session:
         """Load what is to be played.
 
         Args:
-            policy: as for :func:`~xreset.eval.policy_spec.load_policy`.
+            policy: as for :func:`~xreset.eval.deployed.load_deployed`.
             object_name: name of the object; None: the soup can, or else the first object.
             engine: name of the engine.
             robot: default: the policy's.
@@ -144,21 +151,21 @@ class Session:
         self._demos = demos
         self._folder = meshes
         self._seed = seed
-        self.engine = engine
+        self.random = np.random.default_rng(seed)
         self.time = 0.0
-        self._open(policy, robot, object_name)
+        self._open(policy, robot, object_name, engine)
 
     # Choosing ---------------------------------------------------------------------------------------------------------
 
     def choose_policy(
-        self, policy: str | Path | PolicySpec, *, robot: str | Path | None = None
+        self, policy: str | Path | Deployed | PolicySpec, *, robot: str | Path | None = None
     ) -> None:
         """Let another policy act, and begin again. Arguments and errors as for the constructor's."""
-        self._open(policy, robot, self.object_name)
+        self._open(policy, robot, self.object_name, self.engine)
 
     def choose_object(self, name: str) -> None:
         """Play with another object, and begin again; ``XResetError`` if it is unknown."""
-        self._open(self.policy, None, name)
+        self._open(self.policy, None, name, self.engine)
 
     def choose_engine(self, name: str) -> None:
         """Go on in another engine at the same state, with the same memory of the policy.
@@ -166,29 +173,32 @@ class Session:
         Raises:
             XResetError: the engine cannot be used; the session goes on in the present one.
         """
-        env = self._make_env(self.policy, self._inputs, name)
-        env.restore(self.env.snapshot())
-        self.env.close()
-        self.env = env
-        self.engine = name
-        if isinstance(self._player, GraphPolicy):
-            self._player.move(env)
+        world = SingleWorld(name, self.scene, self.world.state)
+        self.world.close()
+        self.world = world
         self._set_gravity()
+
+    @property
+    def engine(self) -> str:
+        """Name of the engine."""
+        return self.world.engine
 
     @property
     def object_name(self) -> str:
         """Name of the object."""
-        return self.env.backend.scene.objects[0].name
+        return self.scene.objects[0].name
 
     def _open(
         self,
-        policy: str | Path | PolicySpec,
+        policy: str | Path | Deployed | PolicySpec,
         robot: str | Path | None,
         object_name: str | None,
+        engine: str,
     ) -> None:
-        """Open worlds; where this fails, the session stays as it was."""
-        policy = load_policy(policy, robot=robot, seed=self._seed)
-        folder = policy.meshes_folder(self._folder)
+        """Open a world; where this fails, the session stays as it was."""
+        policy = load_deployed(policy, robot)
+        controller = None if policy.graph is None else Controller(policy.graph, policy.name)
+        folder = self._folder or policy.meshes
         if self._demos is None:
             names = object_names(folder)
         else:
@@ -197,26 +207,25 @@ class Session:
         name = canonical_name(object_name or (usual if usual in names else names[0]), names)
         source = self._demos or synthesize([name], STARTS, self._seed, meshes=folder)
         inputs = load_inputs(source, robot=policy.robot, meshes=folder, only=[name])
-        env = self._make_env(policy, inputs, self.engine)
-        try:
-            player = policy.begin(env)
-        except BaseException:
-            env.close()
-            raise
-        if hasattr(self, "env"):
-            self.env.close()
-        self.env = env
+        task = TaskConfig() if controller is None else task_of(controller, policy.name)
+        scene = scene_of(policy.robot, inputs.objects[0], task)
+        start, *goal = self._drawn(inputs.bank, scene)
+        world = SingleWorld(engine, scene, start)
+        if hasattr(self, "world"):
+            self.world.close()
+        self.world = world
+        self.scene = scene
+        self.goal_pos, self.goal_quat = goal
         self.policy = policy
         self.objects = names
-        self._inputs = inputs
-        self._player: Policy = player
-        spec = policy.robot
-        self._kinematics = Kinematics(spec)
-        self._stiffness = torch.as_tensor(drive_values(spec, "kp")).float()
-        self.inputs = _slices(
-            layout(len(spec.joints), len(spec.fingertips), policy.task.observation)
-        )
-        self.terms: tuple[str, ...] = ()
+        self.bank = inputs.bank
+        self._controller = controller
+        self._kinematics = on_host(policy.robot)
+        self._stiffness = drive_values(policy.robot, "kp")
+        shapes = {} if controller is None else controller.shapes
+        points = shapes.get("object_points", (64, 3))[0]
+        self._points = surface_points(scene.objects[0], points)
+        self.inputs = {} if controller is None else observation_names(controller)
         self.history: deque[Moment] = deque(maxlen=round(KEPT_SECONDS / self.control_dt))
         self._clear()
 
@@ -225,7 +234,7 @@ class Session:
     @property
     def control_dt(self) -> float:
         """Duration of a control step [s]."""
-        return self.env.backend.scene.control_dt
+        return self.scene.control_dt
 
     def begin(self, *, keep_goal: bool = False) -> None:
         """Begin again: the robot at home, and a start and a goal drawn from the demonstrations.
@@ -233,12 +242,29 @@ class Session:
         Args:
             keep_goal: Draw a start only, and leave the goal where it is.
         """
-        goal = (self.env.goal_pos[0].clone(), self.env.goal_quat[0].clone())
-        self.env.reset()
-        if keep_goal:
-            self.env.goal_pos[0], self.env.goal_quat[0] = goal
-        self._player.begin(self.env)
+        start, *goal = self._drawn(self.bank, self.scene)
+        if not keep_goal:
+            self.goal_pos, self.goal_quat = goal
+        self.world.set_state(start)
         self._clear()
+
+    def _drawn(
+        self, bank: ResetBank, scene: SceneSpec
+    ) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]:
+        """Draw a demonstration of the object: return the state at its start, and the pose of its goal."""
+        own = np.flatnonzero(np.asarray(bank.sequence_object) == scene.objects[0].name)
+        drawn = self.random.choice(own)
+        home = np.clip(scene.robot.home, *joint_limits(scene.robot))
+        start = {
+            "joint_pos": home,
+            "joint_vel": np.zeros_like(home),
+            "joint_target": home,
+            "object_pos": bank.start_pos[drawn],
+            "object_quat": bank.start_quat_wxyz[drawn],
+            "object_linvel": np.zeros(3),
+            "object_angvel": np.zeros(3),
+        }
+        return start, bank.goal_pos[drawn], bank.goal_quat_wxyz[drawn]
 
     def _clear(self) -> None:
         self.away = False
@@ -246,6 +272,17 @@ class Session:
         self._touched = self.time
         self._pull: _Pull | None = None
         self.history.clear()
+        self.target = self.world.state["joint_target"].astype(np.float32)
+        """[J] the present targets of the drives, without a pull at the robot."""
+        if self._controller is not None:
+            self._controller.begin(
+                self._points,
+                self.goal_pos,
+                self.goal_quat,
+                self.target,
+                center(self.scene.objects[0]),
+            )
+        self._set_gravity()
 
     def step(self) -> Moment:
         """Take one control step.
@@ -253,44 +290,60 @@ class Session:
         Raises:
             XResetError: the engine's numbers are no longer finite; a new episode has begun.
         """
-        observations = self.env.get_observations()
-        action = self._player.act(observations)
-        reading, reward = self.env.advance(action, self._apply_pull())
+        inputs = self._act()
+        offset, force, torque = self._pulled()
+        self.world.step(self.target + offset, self.scene.substeps, force, torque)
         self.time += self.control_dt
-        if bool(reading.health.nonfinite):
+        if not self.world.is_finite:
             self.begin()
             raise XResetError(
                 f"The simulation in {self.engine} broke down. A new episode has begun."
             )
-        if self.away or reading.state.object_pos[0, 2] < -1.0:
+        if self.away or self.world.state["object_pos"][2] < -1.0:
             self._remove_object()  # an object that has fallen off the table does not fall for ever
-        state = reading.state
-        self.terms = tuple(reward.terms)
-        values = {
-            "joint_pos": state.joint_pos,
-            "joint_vel": state.joint_vel,
-            "joint_target": self.env.joint_target,
-            "object_pos": state.object_pos,
-            "object_quat": state.object_quat,
-            "goal_pos": self.env.goal_pos,
-            "goal_quat": self.env.goal_quat,
-            "tip_force": reading.contacts.tip_force,
-            "action": action,
-            "inputs": torch.cat((observations["policy"], observations["proprio"]), dim=-1),
-            "reward": torch.stack(list(reward.terms.values()), dim=-1),
-        }
+        state = self.world.state
+        distance = float(np.linalg.norm(state["object_pos"] - self.goal_pos))
+        turn = turn_of(state["object_quat"]).inv() * turn_of(self.goal_quat)
         moment = Moment(
             time=self.time,
             engine=self.engine,
-            distance=float((state.object_pos - self.env.goal_pos).norm()),
-            angle=float(quat_angle(state.object_quat, self.env.goal_quat)),
-            success=bool(reward.success),
-            **{name: value[0].detach().numpy().copy() for name, value in values.items()},
+            joint_pos=state["joint_pos"],
+            joint_vel=state["joint_vel"],
+            joint_target=self.target,
+            object_pos=state["object_pos"],
+            object_quat=state["object_quat"],
+            goal_pos=self.goal_pos,
+            goal_quat=self.goal_quat,
+            tip_force=self.world.tip_force,
+            inputs=inputs,
+            distance=distance,
+            angle=float(turn.magnitude()),
+            success=distance < GOAL_DISTANCE and turn.magnitude() < GOAL_ANGLE,
         )
         self.history.append(moment)
         if self.away or self._pull is not None or moment.tip_force.any():
             self._touched = self.time
         return moment
+
+    def _act(self) -> np.ndarray:
+        """Let the policy set the targets; return what it observed [D]."""
+        controller = self._controller
+        if controller is None:
+            return np.zeros(0)
+        state = self.world.state
+        reading = Reading(
+            joint_pos=state["joint_pos"],
+            joint_vel=state["joint_vel"],
+            joint_time=self.time,
+            object_pos=state["object_pos"],
+            object_quat=state["object_quat"],
+            object_time=self.time,
+            tip_force=self.world.tip_force,
+        )
+        controller.set_goal(self.goal_pos, self.goal_quat)
+        self.target = controller.step(reading)[0]
+        observed = controller.observations
+        return np.zeros(0) if observed is None or not self.inputs else observed[0]
 
     @property
     def dropped(self) -> bool:
@@ -303,13 +356,12 @@ class Session:
     @property
     def lost(self) -> bool:
         """Whether the object has left the table."""
-        env = self.env
-        return bool(out_of_bounds(env.backend.state().object_pos, env.backend.scene.table))
+        return bool(out_of_bounds(self.world.state["object_pos"], self.scene.table))
 
     def cloud(self) -> np.ndarray:
-        """[P, 3] the newest points of the object's surface that the policy observes, world frame [m]."""
-        newest = self.env.get_observations()["perception"][0, -1, :, :3]
-        return newest.numpy() / self.env.task.observation.cloud_scale
+        """[P, 3] the points of the object's surface that the policy observes, world frame [m]."""
+        state = self.world.state
+        return turn_of(state["object_quat"]).apply(self._points) + state["object_pos"]
 
     # The user's hand --------------------------------------------------------------------------------------------------
 
@@ -320,15 +372,14 @@ class Session:
             pos: [3] position of the object's mesh frame [m].
             quat: [4] orientation (w, x, y, z).
         """
-        scene = self.env.backend.scene
+        table = self.scene.table
         turned = np.array(quat, dtype=float) / np.linalg.norm(quat)
-        middle = np.array((*scene.table.center, 0.0))
-        half = np.array((*scene.table.half_size[:2], GOAL_HEIGHT))
+        middle = np.array((*table.center, 0.0))
+        half = np.array((*table.half_size[:2], GOAL_HEIGHT))
         low = middle - half
-        low[2] = float(rest_height(scene.objects[0], turned))
-        goal = np.clip(pos, low, np.maximum(middle + half, low))
-        self.env.goal_pos[0] = torch.as_tensor(goal)
-        self.env.goal_quat[0] = torch.as_tensor(turned)
+        low[2] = float(rest_height(self.scene.objects[0], turned))
+        self.goal_pos = np.clip(pos, low, np.maximum(middle + half, low))
+        self.goal_quat = turned
 
     def grab(self, link: str | None, at: Sequence[float]) -> None:
         """Begin to pull at a point: of a link of the robot, or of the object (None).
@@ -336,19 +387,20 @@ class Session:
         Args:
             at: [3] the point, world frame [m].
         """
-        point = torch.tensor(at, dtype=torch.float32)
-        state = self.env.backend.state()
+        point = np.array(at, dtype=float)
+        state = self.world.state
         if link is None:
-            local = quat_rotate_inverse(state.object_quat[0], point - state.object_pos[0])
+            turn = turn_of(state["object_quat"])
+            local = turn.inv().apply(point - state["object_pos"])
         else:
-            pose = self._kinematics.link_poses(state.joint_pos[0].double(), [link])[0].float()
-            local = pose[:3, :3].T @ (point - pose[:3, 3])
+            T = self._kinematics.link_poses(state["joint_pos"], [link])[0]
+            local = T[:3, :3].T @ (point - T[:3, 3])
         self._pull = _Pull(link=link, point=local, to=point)
 
     def pull(self, to: Sequence[float]) -> None:
         """Pull the grabbed point towards a point [3], world frame [m]. Without :meth:`grab`, nothing happens."""
         if self._pull is not None:
-            self._pull.to = torch.tensor(to, dtype=torch.float32)
+            self._pull.to = np.array(to, dtype=float)
 
     def release(self) -> None:
         """Let go of what was grabbed."""
@@ -363,76 +415,68 @@ class Session:
         self.away = True
         if self._pull is not None and self._pull.link is None:
             self.release()
-        state = self.env.backend.state().clone()
-        state.object_pos.copy_(torch.tensor([AWAY]))
-        state.object_linvel.zero_()
-        state.object_angvel.zero_()
-        self.env.backend.set_state(state)
+        still = {"object_linvel": np.zeros(3), "object_angvel": np.zeros(3)}
+        self.world.set_state(self.world.state | still | {"object_pos": np.array(AWAY)})
         self._set_gravity()
 
     def _set_gravity(self) -> None:
-        fraction = (
-            torch.zeros_like(self.env.gravity_fraction) if self.away else self.env.gravity_fraction
-        )
-        self.env.backend.set_object_gravity(fraction)
+        self.world.set_object_gravity(0.0 if self.away else 1.0)
 
-    def _apply_pull(self) -> Tensor | None:
-        """Set the force on the object for the next step; return what a pull at the robot adds to the targets [1, J]."""
-        backend = self.env.backend
-        force = torch.zeros(3)
-        torque = torch.zeros(3)
-        offset = None
-        if self._pull is not None:
-            state = backend.state()
-            if self._pull.link is None:
-                force, torque = self._pull_object(self._pull, state)
-            else:
-                offset = self._pull_robot(self._pull, self._pull.link, state)
-        if "object_wrench" in backend.capabilities:
-            backend.set_object_wrench(force[None], torque[None])
-        return offset
+    def _pulled(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return what a pull at the robot adds to the targets [J], and force and torque [3] of one at the object."""
+        offset = np.zeros_like(self._stiffness)
+        force = np.zeros(3)
+        torque = np.zeros(3)
+        if self._pull is None:
+            return offset, force, torque
+        if self._pull.link is None:
+            force, torque = self._pull_object(self._pull)
+        else:
+            offset = self._pull_robot(self._pull, self._pull.link)
+        return offset, force, torque
 
-    def _pull_object(self, pull: _Pull, state: State) -> tuple[Tensor, Tensor]:
+    def _pull_object(self, pull: _Pull) -> tuple[np.ndarray, np.ndarray]:
         """Return force and torque [3] of a damped spring, which also carries the object's weight."""
-        body = self.env.backend.scene.objects[0]
-        pos = state.object_pos[0]
-        quat = state.object_quat[0]
-        arm = quat_rotate(quat, pull.point - torch.as_tensor(body.com, dtype=torch.float32))
-        stretch = pull.to - pos - quat_rotate(quat, pull.point)
-        stretch = stretch * min(1.0, PULL_LENGTH / max(float(stretch.norm()), 1e-6))
+        body = self.scene.objects[0]
+        state = self.world.state
+        turn = turn_of(state["object_quat"])
+        arm = turn.apply(pull.point - body.com)
+        stretch = pull.to - state["object_pos"] - turn.apply(pull.point)
+        stretch = stretch * min(1.0, PULL_LENGTH / max(float(np.linalg.norm(stretch)), 1e-6))
         spring = body.mass * PULL_RATE**2 * stretch
         damping = 2 * PULL_RATE
-        weight = torch.tensor((0.0, 0.0, body.mass * GRAVITY))
-        force = spring - body.mass * damping * state.object_linvel[0] + weight
+        weight = np.array((0.0, 0.0, body.mass * GRAVITY))
+        force = spring - body.mass * damping * state["object_linvel"] + weight
         inertia = float(np.linalg.eigvalsh(body.inertia)[-1])
-        return force, torch.linalg.cross(arm, spring) - inertia * damping * state.object_angvel[0]
+        return force, np.cross(arm, spring) - inertia * damping * state["object_angvel"]
 
-    def _pull_robot(self, pull: _Pull, link: str, state: State) -> Tensor:
-        """[1, J] what to add to the targets, so that the drives give the torques of a force at the point as well.
+    def _pull_robot(self, pull: _Pull, link: str) -> np.ndarray:
+        """[J] what to add to the targets, so that the drives give the torques of a force at the point as well.
 
         A force F at a point with Jacobian J acts as the joint torques J^T F. A drive gives kp (target - q), so a target
         that is J^T F / kp farther gives as much, up to the drive's effort limit.
         """
-        joint_pos = state.joint_pos[0].double()
-        at = self._kinematics.jacobian(joint_pos, [link], pull.point[None].double())
+        joint_pos = self.world.state["joint_pos"]
+        at = self._kinematics.jacobian(joint_pos, [link], pull.point[None])
         force = ROBOT_STIFFNESS * (pull.to - at.pos[0])
-        force = force * min(1.0, ROBOT_FORCE / max(float(force.norm()), 1e-6))
-        torque = at.linear[0].T @ force
-        return (torque.float() / self._stiffness)[None]
+        force = force * min(1.0, ROBOT_FORCE / max(float(np.linalg.norm(force)), 1e-6))
+        return (at.linear[0].T @ force) / self._stiffness
 
     def close(self) -> None:
         """Close the engine."""
-        self.env.close()
-
-    def _make_env(self, policy: PolicySpec, inputs: Inputs, engine: str) -> ManipulationEnv:
-        return policy.make_env(inputs.objects, inputs.bank, engine=engine, seed=self._seed)
+        self.world.close()
 
 
-def _slices(groups: dict[str, dict[str, int]]) -> dict[str, slice]:
-    places = {}
-    begin = 0
-    for group in ("policy", "proprio"):
-        for name, width in groups[group].items():
-            places[name] = slice(begin, begin + width)
-            begin += width
-    return places
+def scene_of(robot: RobotSpec, obj: ObjectSpec, task: TaskConfig) -> SceneSpec:
+    """Return the scene in which a policy is played: that of its evaluations, with the friction of the object."""
+    task = evaluation_task(task)
+    middle = sum(task.randomization.friction) / 2
+    pairs = task.randomization.pair_friction(middle if obj.friction is None else obj.friction)
+    tip, link, table = (max(pair, LEAST_FRICTION) for pair in pairs)
+    return SceneSpec(
+        robot=robot,
+        objects=(obj,),
+        friction=replace(PairFriction(), tip=tip, link=link, table=table),
+        timestep=task.timestep,
+        substeps=task.substeps,
+    )

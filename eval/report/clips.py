@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
-import torch
 
 from xreset.cameras.config import VisionConfig
 from xreset.errors import RunError, XResetError, needs
@@ -145,6 +144,8 @@ def draw_view(cameras: Cameras, trace: Trace, row: int, width: int) -> np.ndarra
         trace.goal_pos,
         trace.goal_quat,
     )
+    import torch
+
     joints, pos, quat, goal_pos, goal_quat = (
         torch.as_tensor(value, dtype=torch.float32)[None] for value in now
     )
@@ -161,6 +162,8 @@ def policy_cameras(
     """Return the cameras of a policy, for one world; None if it has none."""
     if vision is None or not vision.cameras:
         return None
+    import torch
+
     from xreset.cameras.sensor import Cameras  # imports Warp, which other policies do not need
 
     return Cameras(SceneSpec(robot=robot, objects=(obj,)), torch.zeros(1, dtype=torch.long), vision)

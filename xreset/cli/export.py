@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from xreset import runtime
@@ -12,7 +13,6 @@ from xreset.eval import verbs
 
 if TYPE_CHECKING:
     from xreset.eval.export.recorded import RecordedEpisodes
-    from xreset.eval.policy_spec import PolicySpec
 
 
 def _show_episodes(recording: RecordedEpisodes, options: Mapping[str, Any]) -> None:
@@ -23,15 +23,14 @@ def _show_episodes(recording: RecordedEpisodes, options: Mapping[str, Any]) -> N
     )
 
 
-def _show_deployed(policy: PolicySpec, options: Mapping[str, Any]) -> None:
-    out = options["out"]
+def _show_deployed(out: Path, options: Mapping[str, Any]) -> None:
     contract = runtime.load_controller(out).contract
     named = []
     for name, entry in contract["objects"].items():
         named.append(f"{name} ({'stand-in' if entry['source'] == 'stand-in' else 'mesh'})")
     rate = 1.0 / contract["control_dt"]
     console.print(
-        f"{out}: {policy.name} for {contract['robot']}, {len(contract['joints'])} joints at {rate:g} Hz"
+        f"{out}: {options['policy']} for {contract['robot']}, {len(contract['joints'])} joints at {rate:g} Hz"
     )
     console.print(f"objects: {', '.join(named)}")
     console.print(f"Try it: cd {out} && python -m runtime")

@@ -154,7 +154,7 @@ def place(
     specs = list(archive.demo_objects(chosen, meshes).values())
     with Progress() as bar:
         paths = pipeline.wrist_paths(chosen, spec, specs, progress=bar.count("hand retargeting"))
-        grounded = pipeline.rest_on_table(every, specs)
+        grounded = archive.rest_on_table(every, specs)
         wrists = grounded.hand_keypoints[grounded.hand_valid, 0]
         avoid = np.concatenate((wrists, grounded.object_pos))
         found = places.place(spec, paths, avoid, search, bar.count("placements"))

@@ -33,7 +33,7 @@ from xreset.files.text import Brief, shown
 from xreset.geometry.shapes import quat_of, turn_of
 from xreset.objects.catalogue import canonical_names, load_object, object_names, official_name
 from xreset.objects.rest import rest_height
-from xreset.spec import ObjectSpec
+from xreset.spec import ObjectSpec, objects_named
 
 SCHEMA_NAME = "xreset-demos/1"
 SIDES = ("right", "left")
@@ -511,3 +511,15 @@ def _problem(arrays: Arrays) -> str | None:
             where = f"First in frame {frame - offsets[sequence]} of sequence {sequence} ({names[sequence]!s})."
             return f"{problem} {where} If the hand is unknown there, set hand_valid to False."
     return None
+
+
+def rest_on_table(demos: Demos, objects: Sequence[ObjectSpec]) -> Demos:
+    """Return the demonstrations over a level table on which each object rests in its first frame (the paper, appendix
+    D.a); keypoints and object poses are in double precision.
+
+    Raises:
+        DemoError: an object of the demonstrations is not among ``objects``.
+    """
+    demos = grounded(levelled(demos), objects_named(objects, demos.object_names))
+    names = ("hand_keypoints", "object_pos", "object_quat_wxyz")
+    return replace(demos, **{name: getattr(demos, name).astype(np.float64) for name in names})

@@ -24,6 +24,8 @@ from xreset.geometry.surface import Surface, prepared_surface
 
 TRUST = "If the recording is right all the same, add --trust-recordings (in Python: trust=True)."
 """The one way to use what is refused."""
+CONTACT_DISTANCE = 0.020
+"""A human keypoint nearer than this to the object's surface touches it [m]."""
 
 _ONE_POINT = 0.01
 """A hand whose keypoints are all this close to its wrist is none [m]."""
@@ -537,3 +539,28 @@ def _longest_run(flags: np.ndarray) -> int:
     """Return the length of the longest run of true flags."""
     ends = np.flatnonzero(np.diff(np.concatenate(([0], flags.astype(int), [0]))))
     return int((ends[1::2] - ends[::2]).max(initial=0))
+
+
+def human_contacts(
+    demos: Demos, surfaces: Mapping[str, Surface], distance: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Find where human hands touch the objects.
+
+    Args:
+        demos: demonstrations over the table.
+        surfaces: surface of every object that the demonstrations name.
+        distance: a keypoint nearer to the surface than this touches it [m].
+
+    Returns:
+        Contact points [F, 21, 3] in the world, zero where there is no contact, and whether there is one [F, 21].
+    """
+    keypoints = np.where(demos.hand_valid[:, None, None], demos.hand_keypoints, np.nan)
+    points = np.zeros_like(keypoints)
+    touching = np.zeros(keypoints.shape[:2], dtype=bool)
+    object_name = demos.object_name[demos.sequence_of_frame]
+    for name in demos.object_names:
+        rows = object_name == name
+        points[rows], touching[rows] = surfaces[name].contacts(
+            keypoints[rows], demos.object_pos[rows], demos.object_quat_wxyz[rows], distance
+        )
+    return points, touching

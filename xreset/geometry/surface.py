@@ -7,15 +7,18 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
+from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
+from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 
-from xreset.geometry.fields import DistanceFields
 from xreset.geometry.shapes import half_spaces, plane_heights, shape_mesh, surface_of, turn_of
-from xreset.physics.tensors import one_thread
 from xreset.spec import ObjectSpec, Shape
+
+if TYPE_CHECKING:
+    from xreset.geometry.fields import DistanceFields
 
 _SAMPLE_SPACING = 0.003
 """Typical distance of the samples that narrow the search for the nearest triangle [m]."""
@@ -76,9 +79,17 @@ class Surface:
         # farther nodes keep the distance to the nearest sample
         near = distance < 2 * _GRID_SPACING + _SAMPLE_SPACING
         _, distance[near] = self.nearest(flat_nodes[near])
-        signed = np.where(inside.reshape(-1), -distance, distance).reshape(counts)
-        self.field = DistanceFields.on_grid(signed, origin, _GRID_SPACING, self.low, self.high)
-        """Signed distances on the grid."""
+        self._origin = origin
+        self._signed = np.where(inside.reshape(-1), -distance, distance).reshape(counts)
+
+    @cached_property
+    def field(self) -> DistanceFields:
+        """Signed distances on the grid, for torch."""
+        from xreset.geometry.fields import DistanceFields
+
+        return DistanceFields.on_grid(
+            self._signed, self._origin, _GRID_SPACING, self.low, self.high
+        )
 
     def samples(self, count: int) -> np.ndarray:
         """[N, 3] at most ``count`` points, evenly drawn from the samples of the surface."""
@@ -86,11 +97,15 @@ class Surface:
         return points[:: -(-len(points) // count)]
 
     def signed_distance(self, points: np.ndarray) -> np.ndarray:
-        """[...] signed distances of points [..., 3], negative inside, from the grid [m]."""
-        flat = torch.as_tensor(points.reshape(-1, 3))
-        with one_thread():
-            distance, _ = self.field.signed_distance(flat, torch.zeros(len(flat), dtype=torch.long))
-        return distance.numpy().reshape(points.shape[:-1])
+        """[...] signed distances of points [..., 3], negative inside, from the grid [m].
+
+        Beyond the grid, the distance to the grid is added.
+        """
+        nodes = (points.reshape(-1, 3) - self._origin) / _GRID_SPACING
+        nearest = nodes.clip(0, np.array(self._signed.shape) - 1)
+        beyond = _GRID_SPACING * np.linalg.norm(nodes - nearest, axis=-1)
+        distance = map_coordinates(self._signed, nearest.T, order=1) + beyond
+        return distance.reshape(points.shape[:-1])
 
     def nearest(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Nearest surface points [N, 3] of points [N, 3], exact on the triangles of the nearest samples, and distances

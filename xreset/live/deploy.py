@@ -11,12 +11,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from xreset import runtime
-from xreset.errors import PolicyError
+from xreset.errors import PolicyError, needs
 from xreset.files.storage import atomic_folder, code_version, is_occupied
 from xreset.geometry.urdf import robot_tree
 from xreset.live import leapp
-from xreset.live.cache import cached_graph
-from xreset.live.graph import policy_graph
 from xreset.objects.sampling import center, surface_points
 from xreset.policy.onnx_policy import (
     METADATA_KEY,
@@ -28,7 +26,6 @@ from xreset.policy.onnx_policy import (
 from xreset.runtime import Controller
 from xreset.runtime.contract import KEY, POLICY, SCHEMA, check_contract
 from xreset.spec import ObjectSpec, RobotSpec
-from xreset.task.actions import ActionSpace
 from xreset.task.config import EVALUATION_TIMESTEP, ActionConfig, TaskConfig
 
 if TYPE_CHECKING:
@@ -56,6 +53,7 @@ MEANINGS = {
     "target": "joint targets for position drives, within the joints' limits [rad, m]",
     "memory_out": "memory_in of the next step",
     "links": "positions of the links, world [m]: palm, then fingertips",
+    "observations": "what the network was told, without the points: to look at, not needed for control",
 }
 """Meaning of every input and output that a graph may have."""
 
@@ -70,14 +68,6 @@ def deploy_contract(
         task: task of the policy's training.
         objects: objects whose points the contract lists.
     """
-    listed = {}
-    for each in objects:
-        points = surface_points(each, task.observation.cloud_points)
-        listed[each.name] = {
-            "source": each.source,
-            "points": _rounded(points),
-            "center": _rounded(center(each)),
-        }
     contract = {
         "schema": SCHEMA,
         "xreset": code_version(),
@@ -91,10 +81,22 @@ def deploy_contract(
         "joints": _joints(robot, task),
         "fingertips": list(robot.fingertip_names),
         "links": list(robot.tracked_links),
-        "objects": listed,
+        "objects": _listed(objects, task.observation.cloud_points),
     }
     check_contract(contract, f"The task of {robot.name}")
     return contract
+
+
+def _listed(objects: Sequence[ObjectSpec], cloud_points: int) -> dict[str, Any]:
+    """Return points and center of objects, by name."""
+    listed = {}
+    for each in objects:
+        listed[each.name] = {
+            "source": each.source,
+            "points": _rounded(surface_points(each, cloud_points)),
+            "center": _rounded(center(each)),
+        }
+    return listed
 
 
 def _rounded(values: np.ndarray) -> list[Any]:
@@ -104,6 +106,8 @@ def _rounded(values: np.ndarray) -> list[Any]:
 
 def _joints(robot: RobotSpec, task: TaskConfig) -> list[dict[str, Any]]:
     """Return name, limits and step of every joint, in joint order."""
+    from xreset.task.actions import ActionSpace
+
     space = ActionSpace(robot, task.action)
     tree = robot_tree(robot)
     rows = []
@@ -145,6 +149,9 @@ def deployed_graph(
     """
     import onnx
 
+    from xreset.live.cache import cached_graph
+    from xreset.live.graph import policy_graph
+
     if isinstance(network, bytes):
         model = cached_graph(network, robot, task)
     else:
@@ -152,6 +159,30 @@ def deployed_graph(
     trained = policy_contract(robot, task, tuple(o.name for o in objects))
     entries = {KEY: json.dumps(deploy_contract(robot, task, objects)), **contract_metadata(trained)}
     onnx.helper.set_model_props(model, entries)
+    return model.SerializeToString()
+
+
+def made_for(graph: bytes, robot: RobotSpec) -> bool:
+    """Return whether a deployed policy was made for a robot with this description, in the same place."""
+    return Controller(graph).contract.get("robot_fingerprint") == robot.fingerprint
+
+
+def with_objects(graph: bytes, objects: Sequence[ObjectSpec]) -> bytes:
+    """Return a deployed policy whose contract lists other objects. It needs no torch."""
+    controller = Controller(graph)
+    points = controller.shapes.get("object_points", (1, 3))[0]
+    listed = _listed(objects, points)
+    contract = {**controller.contract, "xreset": code_version(), "objects": listed}
+    return with_metadata(graph, {KEY: json.dumps(contract)})
+
+
+def with_metadata(graph: bytes, entries: dict[str, str]) -> bytes:
+    """Return a graph with other entries of its metadata; the others stay."""
+    with needs("onnx", "deploy", PolicyError):
+        import onnx
+    model = onnx.load_from_string(graph)
+    stated = {entry.key: entry.value for entry in model.metadata_props}
+    onnx.helper.set_model_props(model, stated | entries)
     return model.SerializeToString()
 
 

@@ -123,14 +123,10 @@ class GraphPolicy:
 
     def begin(self, env: ManipulationEnv) -> None:
         """Begin an episode in every world."""
-        self.move(env)
-        begin_episodes(self._controller, env)
-
-    def move(self, env: ManipulationEnv) -> None:
-        """Go on in other worlds with the same objects."""
         self._env = env
         self._driver = EngineDriver(env)
         self._center = torch.as_tensor(centers(env), device=env.device)
+        begin_episodes(self._controller, env)
 
     def act(self, observations: Any) -> Tensor:
         """[N, J] actions whose targets are those of the graph. The tracker of the environment reports the object."""

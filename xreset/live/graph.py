@@ -222,10 +222,16 @@ def policy_graph(network: bytes | nn.Module, robot: RobotSpec, task: TaskConfig)
     joined = onnx.compose.merge_models(
         first, middle, io_map=[(f"observe/{name}", f"network/{name}") for name in wanted]
     )
+    widths = {value.name: value.type.tensor_type.shape.dim[-1] for value in first.graph.output}
     action, *states = [value.name for value in middle.graph.output]
     joined = onnx.compose.merge_models(
         joined, last, io_map=[(action, "act/action"), ("observe/kept", "act/kept")]
     )
+    if "observe/flat" in widths:
+        shape = ["worlds", widths["observe/flat"].dim_value]
+        joined.graph.output.append(
+            onnx.helper.make_tensor_value_info("observe/flat", onnx.TensorProto.FLOAT, shape)
+        )
     _finish(joined, states, observe.memory)
     return joined
 
@@ -256,6 +262,7 @@ def _finish(model: ModelProto, states: Sequence[str], memory: int) -> None:
         "observe/memory": "memory_in",
         "act/target": "target",
         "observe/links": "links",
+        "observe/flat": "observations",
     }
     inputs = {}
     for value in graph.input:
@@ -274,7 +281,8 @@ def _finish(model: ModelProto, states: Sequence[str], memory: int) -> None:
         "memory_out", onnx.TensorProto.FLOAT, ["worlds", memory]
     )
     _replace(graph.input, inputs.values())
-    _replace(graph.output, (outputs["target"], out, outputs["links"]))
+    shown = [outputs[name] for name in ("links", "observations") if name in outputs]
+    _replace(graph.output, (outputs["target"], out, *shown))
 
 
 def _replace(listed: Any, values: Iterable[ValueInfoProto]) -> None:

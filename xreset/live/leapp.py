@@ -36,10 +36,12 @@ def leapp_description(graph: bytes) -> str:
     controller = Controller(graph)
     contract = controller.contract
     joints = [joint["name"] for joint in contract["joints"]]
+    observed = controller.observations
     shapes = {
         "target": (len(joints),),
         "memory_out": controller.shapes.get("memory_in", ()),
         "links": (len(contract.get("links", ())), 3),
+        "observations": () if observed is None else observed.shape[1:],
     }
     outputs = {name: shapes[name] for name in controller.outputs}
     feedback = {f"{_NODE}/memory_out": [f"{_NODE}/memory_in"]} if "memory_out" in outputs else {}

@@ -14,8 +14,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from xreset.errors import PolicyError, WrongValueError, needs
 from xreset.files.checks import parsed
@@ -24,10 +22,11 @@ from xreset.files.text import shown
 from xreset.spec import RobotSpec
 from xreset.task.config import TaskConfig
 from xreset.task.contract import SCHEMA, Contract
-from xreset.task.observations import Observer, cloud_shape, layout
 
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # functions import torch, so that contracts are read without it
+    import torch
     from tensordict import TensorDict
+    from torch import Tensor
 
     from xreset.env.manipulation import ManipulationEnv
 
@@ -57,6 +56,8 @@ class Policy(Protocol):
 
 def policy_contract(robot: RobotSpec, task: TaskConfig, objects: tuple[str, ...]) -> Contract:
     """Return everything that must agree between training and evaluation."""
+    from xreset.task.observations import layout
+
     return Contract(
         schema=SCHEMA,
         robot=robot.name,
@@ -148,12 +149,7 @@ def parsed_contract(source: str, contract: Any, version: str | None = None) -> C
         version: the version of xreset that exported the policy, if it states it.
     """
     typed, problems = parsed(Contract, contract, f"The contract of {source}", version)
-    if typed is not None:
-        try:
-            Observer(typed.task.observation)
-        except WrongValueError as error:
-            problems = [f"The contract of {source}: {error}"]
-    if typed is None or problems:
+    if typed is None:
         raise PolicyError(" ".join([*problems, "Export the policy again."]))
     return typed
 
@@ -175,6 +171,8 @@ def observation_shapes(contract: Contract, source: str) -> dict[str, tuple[int, 
 
 def picture_shape(task: TaskConfig) -> tuple[int, ...]:
     """Return the shape of the last of ``task.policy_groups`` for one world."""
+    from xreset.task.observations import cloud_shape
+
     return task.vision.view_shape if task.vision.cameras else cloud_shape(task.observation)
 
 
@@ -234,6 +232,8 @@ class OnnxPolicy:
 
     def _try_step(self, path: Path) -> None:
         """Take one step with zeros, so that a policy that cannot act is refused before work begins."""
+        import torch
+
         observed = observation_shapes(self.contract, str(path))
         worlds = 2
         zeros = {name: torch.zeros(worlds, *shape) for name, shape in observed.items()}
@@ -269,6 +269,8 @@ class OnnxPolicy:
 
     def act(self, observations: TensorDict) -> Tensor:
         """[N, J] mean action, on the observations' device."""
+        import torch
+
         actions, *state = self._outputs(observations)
         self._state = [np.array(value) for value in state]
         device = observations["proprio"].device
@@ -276,10 +278,12 @@ class OnnxPolicy:
 
     def _outputs(self, observations: TensorDict | dict[str, Tensor]) -> list[np.ndarray]:
         """Return the graph's outputs: actions [N, J] without limits, and the LSTM's next state."""
+        import torch
+
         groups = self.contract.task.policy_groups
         for name in groups:
             value = observations.get(name, None)
-            if not isinstance(value, Tensor) or value.dim() < 2:
+            if not isinstance(value, torch.Tensor) or value.dim() < 2:
                 raise PolicyError(
                     f"observations[{name!r}] is {shown(value)}, expected a tensor [N, ...] of env.get_observations()."
                 )
@@ -305,7 +309,14 @@ def _read_contract(path: Path, metadata: dict[str, str]) -> Contract:
         raise PolicyError(
             f"{path} holds a contract that is not valid JSON ({error}). Export it again."
         ) from error
-    return parsed_contract(str(path), contract, metadata.get(VERSION_KEY))
+    typed = parsed_contract(str(path), contract, metadata.get(VERSION_KEY))
+    from xreset.task.observations import Observer
+
+    try:
+        Observer(typed.task.observation)
+    except WrongValueError as error:
+        raise PolicyError(f"The contract of {path}: {error}. Export the policy again.") from error
+    return typed
 
 
 def _why_unreadable(path: Path, error: Exception) -> str:
@@ -338,10 +349,14 @@ class RandomPolicy(Policy):
 
     def __init__(self, num_actions: int, seed: int) -> None:
         self._num_actions = num_actions
-        self._generator = torch.Generator().manual_seed(seed)
+        import torch
+
+        self._generator: torch.Generator = torch.Generator().manual_seed(seed)
 
     def act(self, observations: TensorDict) -> Tensor:
         """[N, J] uniform."""
+        import torch
+
         flat = observations["policy"]
         share = torch.rand(len(flat), self._num_actions, generator=self._generator)
         return (2.0 * share - 1.0).to(flat.device)

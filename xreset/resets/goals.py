@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, replace
 from itertools import product
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -31,9 +31,10 @@ from xreset.geometry.shapes import quat_of, turn_of
 from xreset.objects.rest import rest_height, resting_orientation
 from xreset.resets.bank import ResetBank, bank_problem, check_objects, no_states
 from xreset.resets.config import GoalConfig
-from xreset.resets.reach import Reach
-from xreset.resets.settle import settle_starts
 from xreset.spec import ObjectSpec, RobotSpec
+
+if TYPE_CHECKING:
+    from xreset.resets.reach import Reach
 
 SCHEMA = "xreset-goals/1"
 OWN = "own"
@@ -109,6 +110,8 @@ def drawn_goals(
         for pos, quat in own:
             _check_above_table(obj.name, rest_height(obj, quat) - pos[2])
     rests = _resting_poses(objects, robot, upright=config.upright)
+    from xreset.resets.reach import Reach  # torch, which a player of goals does not need
+
     reach = Reach(robot)
     wanted = [*product(families, range(config.per_family)), *product([OWN], range(len(own)))]
     episodes = []
@@ -213,6 +216,8 @@ def checked_goals(
         GoalError: a start is not on the table, or a goal is inside it or out of reach.
     """
     check_objects(where, goals, tuple(objects))
+    from xreset.resets.reach import Reach
+
     is_own = robot.has_fingerprint(goals.robot_fingerprint)
     reach = Reach(robot)
     for obj in objects:
@@ -294,6 +299,8 @@ def _resting_poses(
             center = np.array([*_MIDDLE, rest_height(obj, quat_of(turn))]) + turn.apply(obj.com)
             place = {"start": center, "start_turn": turn, "goal": center, "goal_turn": turn}
             episodes.append(_Episode(obj=obj, family="rest", number=len(episodes), **place))
+    from xreset.resets.settle import settle_starts
+
     settled, at_rest = settle_starts(_goal_set(robot, episodes), robot, objects)
     rests = {}
     for obj in objects:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Literal
 
 from xreset.demos.archive import SCHEMA_NAME as DEMOS
-from xreset.demos.archive import Demos, demo_objects, read_demos
+from xreset.demos.archive import Demos, demo_objects, read_demos, rest_on_table
 from xreset.errors import DemoError, FileFormatError, XResetError
 from xreset.files.checks import frozen
 from xreset.files.progress import Progress, unseen
@@ -32,7 +32,6 @@ from xreset.resets.goals import SCHEMA as GOALS
 from xreset.resets.goals import GoalSet, checked_goals, read_goals
 from xreset.retarget.file import SCHEMA as MOTION
 from xreset.retarget.file import Retargeted, check_retargeted, object_sources, read_retargeted
-from xreset.retarget.pipeline import rest_on_table
 from xreset.retarget.verbs import retarget_demos
 from xreset.spec import ObjectSpec, RobotSpec, check_robot, checked_objects
 

@@ -5,21 +5,22 @@ Shape letters: F frames of all sequences, S sequences of a batch padded to T fra
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from xreset.demos.archive import Demos, grounded, levelled
+from xreset.demos.archive import Demos, rest_on_table
+from xreset.demos.examine import CONTACT_DISTANCE, human_contacts
 from xreset.files.checks import Checked, frozen
 from xreset.files.processes import in_processes
 from xreset.files.progress import Progress, unseen
 from xreset.geometry.fields import DistanceFields
 from xreset.geometry.rotations import matrix_to_quat, quat_to_matrix
-from xreset.geometry.surface import Surface, prepared_surface
+from xreset.geometry.surface import prepared_surface
 from xreset.physics.tensors import one_thread
 from xreset.retarget.arm.config import ArmSearch
 from xreset.retarget.arm.model import ArmModel, ArmTargets
@@ -36,8 +37,6 @@ _SEQUENCES_PER_BATCH = 24
 """Enough to use the processor well; few enough to keep memory below about 1 GB and to show progress."""
 _FRAMES_AT_ONCE = 512
 """Frames whose measures are taken at a time; limits the memory that this takes."""
-CONTACT_DISTANCE = 0.020
-"""A human keypoint nearer than this to the object's surface touches it [m]."""
 _THRESHOLDS = Thresholds()
 """Limits of a valid frame."""
 _THUMB = slice(1, 5)
@@ -271,43 +270,6 @@ class HandMotions:
             object_index=torch.as_tensor(self._object_index[sequences]),
             fields=self._fields,
         )
-
-
-def human_contacts(
-    demos: Demos, surfaces: Mapping[str, Surface], distance: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Find where human hands touch the objects.
-
-    Args:
-        demos: demonstrations over the table.
-        surfaces: surface of every object that the demonstrations name.
-        distance: a keypoint nearer to the surface than this touches it [m].
-
-    Returns:
-        Contact points [F, 21, 3] in the world, zero where there is no contact, and whether there is one [F, 21].
-    """
-    keypoints = np.where(demos.hand_valid[:, None, None], demos.hand_keypoints, np.nan)
-    points = np.zeros_like(keypoints)
-    touching = np.zeros(keypoints.shape[:2], dtype=bool)
-    object_name = demos.object_name[demos.sequence_of_frame]
-    for name in demos.object_names:
-        rows = object_name == name
-        points[rows], touching[rows] = surfaces[name].contacts(
-            keypoints[rows], demos.object_pos[rows], demos.object_quat_wxyz[rows], distance
-        )
-    return points, touching
-
-
-def rest_on_table(demos: Demos, objects: Sequence[ObjectSpec]) -> Demos:
-    """Return the demonstrations over a level table on which each object rests in its first frame (the paper, appendix
-    D.a); keypoints and object poses are in double precision.
-
-    Raises:
-        DemoError: an object of the demonstrations is not among ``objects``.
-    """
-    demos = grounded(levelled(demos), objects_named(objects, demos.object_names))
-    names = ("hand_keypoints", "object_pos", "object_quat_wxyz")
-    return replace(demos, **{name: getattr(demos, name).astype(np.float64) for name in names})
 
 
 @dataclass(frozen=True)

@@ -49,6 +49,7 @@ class Controller:
         target: [N, J] the present joint targets. The policy starts from them: a loop that sends others sets them here.
         links: [N, 1 + E, 3] palm and fingertips in the last reading, world frame [m]; None: the graph does not give
             them, or no step was taken.
+        observations: [N, D] what the policy was told in the last step, without the object's points; None as for links.
     """
 
     def __init__(self, content: bytes, source: str = "The policy") -> None:
@@ -84,6 +85,7 @@ class Controller:
         self.step_size = joint_values(self.contract, "step", 0.0)
         self.speed = joint_values(self.contract, "velocity", np.inf)
         self.links: Array | None = None
+        self.observations: Array | None = None
         self._has_begun = False
         self.shapes = self._checked_shapes(inputs, source)
         try:
@@ -172,6 +174,7 @@ class Controller:
         if _MEMORY in self.shapes:
             self._given[_MEMORY] = np.zeros((len(given), *self.shapes[_MEMORY]), np.float32)
         self.links = None
+        self.observations = None
         self._has_begun = True
 
     def set_goal(self, pos: Array, quat: Array) -> None:
@@ -260,15 +263,16 @@ class Controller:
             ValueError: data that no robot may leave out are None.
         """
         self._must_have_begun()
-        targets, memory, links = self._run(reading.batched())
-        if memory is not None:
-            self._given[_MEMORY] = memory
-        self.links = links
-        self.target = np.clip(targets, self.lower, self.upper)
+        outputs = self._run(reading.batched())
+        if "memory_out" in outputs:
+            self._given[_MEMORY] = outputs["memory_out"]
+        self.links = outputs.get("links")
+        self.observations = outputs.get("observations")
+        self.target = np.clip(outputs["target"], self.lower, self.upper)
         return self.target
 
-    def _run(self, reading: Reading) -> tuple[Array, Array | None, Array | None]:
-        """Return targets, memory and links for a reading with the axis N."""
+    def _run(self, reading: Reading) -> dict[str, Array]:
+        """Return the graph's outputs by name, for a reading with the axis N."""
         feed = {"joint_target": self.target, **self._given}
         robots = len(self.target)
         for name in _READINGS:
@@ -285,8 +289,7 @@ class Controller:
             feed[name] = value
         feed = {name: feed[name] for name in self.shapes}
         outputs = [np.asarray(value) for value in self._session.run(None, feed)]
-        by_name = dict(zip(self.outputs, outputs, strict=True))
-        return by_name["target"], by_name.get("memory_out"), by_name.get("links")
+        return dict(zip(self.outputs, outputs, strict=True))
 
     def _try_step(self) -> None:
         """Take a step from home, so that a policy that cannot act is refused before a robot moves."""

@@ -362,6 +362,17 @@ class RandomizationConfig(Checked):
     camera_latency: Range = (0.0, 0.0)
     """Range of the additional age of images [control steps], rounded to whole steps."""
 
+    def pair_friction(self, material: Any, link: Any = None) -> tuple[Any, Any, Any]:
+        """Return the friction of the pairs object-fingertip, object-link, object-table: numbers or tensors.
+
+        Args:
+            material: the object material's coefficient. A pair's coefficient is the mean of its two materials.
+            link: coefficient of the links except the fingertips; None: ``metal``.
+        """
+        others = (self.elastomer, self.metal if link is None else link, self.table)
+        tip, link, table = ((material + other) / 2 for other in others)
+        return tip, link, table
+
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.tracker.jitter and not self.observation_latency[1]:

@@ -13,15 +13,8 @@ from xreset.task.config import RandomizationConfig
 def pair_friction(
     material: Tensor, c: RandomizationConfig, link: Tensor | float | None = None
 ) -> Tensor:
-    """[M, 3] friction of the pairs object-fingertip, object-link, object-table.
-
-    Args:
-        material: [M] the object material's coefficient. A pair's coefficient is the mean of its two materials.
-        c: the other materials' coefficients.
-        link: [M] coefficient of the links except the fingertips; None: ``c.metal``.
-    """
-    others = (c.elastomer, c.metal if link is None else link, c.table)
-    return torch.stack([(material + other) / 2 for other in others], dim=-1)
+    """[M, 3] :meth:`RandomizationConfig.pair_friction` of materials [M] and of links [M]."""
+    return torch.stack(c.pair_friction(material, link), dim=-1)
 
 
 MATERIALS = 250

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from xreset.demos.archive import Demos, ObjectMotions, read_demos
-from xreset.demos.examine import examine
+from xreset.demos.archive import Demos, ObjectMotions, read_demos, rest_on_table
+from xreset.demos.examine import CONTACT_DISTANCE, examine, human_contacts
 from xreset.errors import XResetError
 from xreset.files.records import stated_doubts
 from xreset.geometry.surface import prepared_surface
@@ -20,7 +20,6 @@ from xreset.resets.bank import ResetBank
 from xreset.resets.goals import GoalSet
 from xreset.resets.inputs import Inputs, load_inputs
 from xreset.retarget.file import Retargeted
-from xreset.retarget.pipeline import CONTACT_DISTANCE, human_contacts, rest_on_table
 from xreset.spec import ObjectSpec, RobotSpec
 
 _BANK_RATE = 5.0

@@ -1,4 +1,5 @@
-"""Trained policies that ship with xreset: ``NAME.onnx`` in this folder, and the card ``NAME.toml``.
+"""Trained policies that ship with xreset: ``NAME.onnx`` in this folder, the card ``NAME.toml``, and the deployed graph
+``graphs/NAME.onnx``.
 
 The command line knows such a policy as NAME.
 """
@@ -33,6 +34,21 @@ class Card:
 def shipped() -> dict[str, Path]:
     """Name -> file of every policy that ships with this installation, in order of name."""
     return {file.stem: file for file in sorted(FOLDER.glob("*.onnx"))}
+
+
+def shipped_graphs() -> dict[str, Path]:
+    """Name -> file of the deployed graph (``docs/live.md``) of every such policy without cameras.
+
+    ``ci/ship_graphs.py`` writes these files."""
+    return {file.stem: file for file in sorted((FOLDER / "graphs").glob("*.onnx"))}
+
+
+def graph_of(network: bytes) -> bytes | None:
+    """Return the deployed graph of an exported policy's content; None if it does not ship with xreset."""
+    for name, file in shipped_graphs().items():
+        if (FOLDER / f"{name}.onnx").read_bytes() == network:
+            return file.read_bytes()
+    return None
 
 
 def card(file: Path) -> Card:

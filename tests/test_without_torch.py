@@ -1,0 +1,85 @@
+"""What works without torch: playing, exporting a policy that ships, pictures and pages of files, and reports."""
+
+import subprocess
+import sys
+from importlib.util import find_spec
+from unittest import skipUnless
+
+from tests.data import InFolder
+from tests.toy_results import toy_result
+from xreset.eval.results import write_result
+from xreset.policy.shipped import shipped_graphs
+
+BLOCKED = """
+import sys
+
+class NoTorch:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in ("torch", "tensordict"):
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+
+sys.meta_path.insert(0, NoTorch())
+"""
+PLAY = """
+import numpy as np
+from xreset.eval.play.record import write_film, write_trace
+from xreset.eval.play.session import Session
+
+session = Session("many-objects", object_name="mustard")
+moment = session.step()
+session.move_goal(moment.goal_pos + [0.05, 0.0, 0.0], moment.goal_quat)
+session.grab("wrist_2_link", [0.4, 0.1, 0.5])
+session.pull([0.4, 0.2, 0.5])
+session.step()
+session.release()
+session.choose_object("soup")
+for _ in range(120):
+    moment = session.step()
+print(moment.distance)
+session.take_away()
+session.step()
+session.begin(keep_goal=True)
+session.choose_policy("zero", robot="openarm")
+for _ in range(3):
+    still = session.step()
+assert np.ptp([m.joint_target for m in session.history], axis=0).max() == 0
+write_trace("play.trace.npz", session)
+write_film("play.mp4", session, seconds=0.1)
+"""
+
+
+@skipUnless(find_spec("onnxruntime") and find_spec("mujoco"), "needs onnxruntime and mujoco")
+class WithoutTorchTest(InFolder):
+    def run_blocked(self, code):
+        """Run code in a process that finds no torch; returns what it prints."""
+        done = subprocess.run(
+            [sys.executable, "-c", BLOCKED + code], cwd=self.folder, capture_output=True, text=True
+        )
+        self.assertEqual(done.returncode, 0, done.stderr[-3000:])
+        return done.stdout
+
+    def run_commands(self, *commands):
+        calls = [f"main({command.split()!r})\n" for command in commands]
+        return self.run_blocked("from xreset.cli import main\n" + "".join(calls))
+
+    def test_a_policy_plays(self):
+        distance = float(self.run_blocked(PLAY))
+        self.assertLess(distance, 0.03)
+        self.assertTrue((self.folder / "play.mp4").stat().st_size)
+
+    @skipUnless(find_spec("onnx"), "onnx is not installed")
+    def test_policies_that_ship_are_exported(self):
+        for name in shipped_graphs():
+            with self.subTest(name):
+                self.run_commands(f"export deploy {name} --out on_robot/{name} --object soup")
+                self.assertTrue((self.folder / "on_robot" / name / "policy.onnx").exists())
+
+    def test_demonstrations_and_results_are_shown(self):
+        write_result(self.folder / "run" / "eval", toy_result(), [], ("a",))
+        found = self.run_commands(
+            "demos synth --objects soup --per-object 1 --out demos.npz",
+            "view demos.npz --png demos.png",
+            "report run --out page",
+        )
+        self.assertIn("page: page", found)
+        self.assertTrue((self.folder / "page" / "index.html").exists())

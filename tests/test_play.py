@@ -9,6 +9,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from tests.data import InFolder
 from tests.test_view import send_value
+from xreset.backends.mujoco import MujocoBackend
+from xreset.backends.single import SingleWorld, _BatchWorld
 from xreset.errors import XResetError
 from xreset.eval.play.record import write_film, write_trace
 from xreset.eval.play.session import AWAY, Session
@@ -124,6 +126,25 @@ class Played(InFolder):
                     assert_allclose(value, before[name], atol=1e-5, rtol=0, err_msg=name)
                 self.assertIs(session._controller._given["memory_in"], memory)
                 self.assertEqual(session.step().engine, engine)
+
+    def test_the_only_world_of_an_engine_of_many_acts_as_a_world_in_numpy(self):
+        session = self.session
+        force = np.array((0.0, 0.5, 8.0))
+        alone = SingleWorld("mujoco", session.scene, session.world.state)
+        many = SingleWorld("mujoco", session.scene, session.world.state)
+        self.addCleanup(alone.close)
+        many.close()
+        many._world = _BatchWorld(MujocoBackend(session.scene, 1))
+        many.set_state(alone.state)
+        self.addCleanup(many.close)
+        for world in (alone, many):
+            world.set_object_gravity(0.5)
+            for _ in range(5):
+                world.step(session.target, session.scene.substeps, force, 0.01 * force)
+        self.assertGreater(alone.state["object_linvel"][2], 0.1)
+        for name, value in alone.state.items():
+            assert_allclose(many.state[name], value, atol=1e-4, rtol=0, err_msg=name)
+        assert_allclose(many.tip_force, alone.tip_force, atol=1e-3)
 
     def test_what_cannot_be_used_changes_nothing(self):
         session = self.session

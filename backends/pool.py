@@ -183,7 +183,7 @@ class PoolBackend(Backend):
             object_index: see :class:`Backend`.
             device: ``cpu``.
             workers: number of processes; 0 runs the worlds in this process. Default: one per usable core, but no more
-                than worlds; this process if there is only one world.
+                than worlds; this process if there is only one world or one core.
             world_options: further keywords of the world class (picklable).
 
         Raises:
@@ -201,7 +201,7 @@ class PoolBackend(Backend):
         refuse_unknown_options(self.name, world_options, self.world_class, own)
         super().__init__(scene, num_worlds, object_index=object_index, device=device)
         if workers is None:
-            workers = 0 if num_worlds == 1 else usable_cores()
+            workers = 0 if 1 in (num_worlds, usable_cores()) else usable_cores()
         if workers < 0:
             raise WrongValueError(f"workers is {workers}, expected 0 or more")
         layout = layout_of(scene, self.object_index)

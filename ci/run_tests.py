@@ -56,6 +56,12 @@ class Result(unittest.TextTestResult):
         self.passed += 1
 
 
+def keep_to_a_core(cores) -> None:
+    """Take one of the cores for this process, so that what it tests starts no processes for the others."""
+    os.sched_setaffinity(0, {cores.get()})
+    restore_interrupts()
+
+
 def restore_interrupts() -> None:
     # A process in the background of a script ignores Ctrl-C, and so do its children, which some tests interrupt.
     signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -79,9 +85,14 @@ def run_all(names: list[str], processes: int):
     if processes == 1:
         yield from map(run, names)
         return
-    os.environ.setdefault("OMP_NUM_THREADS", "1")  # each process keeps to its own core
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
     spawned = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(processes, mp_context=spawned, initializer=restore_interrupts) as pool:
+    cores = spawned.Queue()
+    for core in os.sched_getaffinity(0):
+        cores.put(core)
+    with ProcessPoolExecutor(
+        processes, mp_context=spawned, initializer=keep_to_a_core, initargs=(cores,)
+    ) as pool:
         name_of = {pool.submit(run, name): name for name in names}
         for done in as_completed(name_of):
             try:

@@ -133,7 +133,7 @@ class Wrong(InFolder):
         offset = demos.hand_keypoints + np.float32([0.0, 0.025, 0.0])
         for words, wrong, changed in (
             (
-                "stays exactly where it is for 0.3 s or longer, and then jumps",
+                "does not change at all for 0.3 s or longer, and then jumps",
                 False,
                 {"object_pos": lost},
             ),

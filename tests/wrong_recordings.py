@@ -176,6 +176,7 @@ def hand_files(file, rng):
         ("little finger to thumb", fingers[:, ::-1]),
         ("tips to bases", fingers[:, :, ::-1]),
         ("thumb last", fingers[:, [1, 2, 3, 4, 0]]),
+        ("ring finger before middle finger", fingers[:, [0, 1, 3, 2, 4]]),
     ):
         order = np.concatenate((wrist, changed.reshape(-1, 20, 3)), axis=1)
         yield f"order: {name}", replace(file, points=order)
@@ -234,6 +235,14 @@ def tracking_files(file):
     lost = file.pos.copy()
     lost[first : first + count] = file.pos[first]
     yield "frozen: object", replace(file, pos=lost)
+    turns = np.arange(len(pos))
+    turns[first : first + count] = first
+    yield "frozen: orientation of the object", replace(file, turn=file.turn[turns])
+    rng = np.random.default_rng(1)
+    noise = rng.normal(0.0, 0.01, pos.shape)
+    yield "object: trembles by 1 cm", replace(file, pos=file.pos + noise)
+    tremor = Rotation.from_rotvec(rng.normal(0.0, np.radians(8.0), pos.shape))
+    yield "object: trembles by 8 degrees", replace(file, turn=tremor * file.turn)
     twice = np.repeat(np.arange(len(pos)), 2)
     yield (
         "copies: every frame twice",
@@ -244,6 +253,8 @@ def tracking_files(file):
     twice = twice[: len(pos)]
     held = np.arange(len(pos)) // 3 * 3
     yield "copies: hand at a third of the rate", replace(file, points=points[held])
+    slow = replace(file, pos=file.pos[held], turn=file.turn[held])
+    yield "copies: object at a third of the rate", slow
     unseen = points.copy()
     unseen[moving[0] - 2 :] = np.nan
     yield "absent: hand while the object moves", replace(file, points=unseen)

@@ -80,6 +80,17 @@ _FROZEN = 0.3
 0."""
 _GOES_ON = 0.02
 """Step of an object's position with which it goes on where its tracker had lost it [m]."""
+_TURNS_ON = np.radians(5.0)
+"""The same of its orientation [rad]."""
+_TREMBLES = 0.003
+"""Largest noise of an object's position in the calmest quarter of the frames, from second differences [m]: 0.0008."""
+_TURN_TREMBLES = np.radians(3.0)
+"""The same of its orientation [rad]: 1.1 degrees."""
+_CALM = 1.2
+"""Acceleration of an object in the calmest quarter of the frames [m/s^2]; 1.2 in recordings at 10 per second that begin
+with the lift."""
+_TURN_CALM = np.radians(1100.0)
+"""The same of its orientation [rad/s^2]: 1100 degrees."""
 _NEVER_TURNS = np.radians(0.1)
 """Smallest angle by which an object that moves turns [rad]: some degrees."""
 _LOWERED = 0.05
@@ -342,6 +353,10 @@ def _order_problem(points: np.ndarray) -> str:
     if bases[thumb] < _THUMB_RATIO * bases[0]:
         order = " The fingers may go from the little finger to the thumb." * (thumb == 4)
         return f"Of the five fingers, number {thumb + 1} begins next to the wrist, as only a thumb does.{order}"
+    across = points[:, 17] - points[:, 5]
+    row = np.median(((points[:, 5::4] - points[:, 5:6]) * across[:, None]).sum(axis=-1), axis=0)
+    if not (np.diff(row) > 0).all():
+        return "The knuckles are not in a row from the index to the little finger."
     return ""
 
 
@@ -434,8 +449,7 @@ def _doubts_of_speed(r: Recording, jumps: np.ndarray) -> Iterator[Finding]:
             f"Is the rate of {r.fps:g} frames per second right (--fps)?",
         )
     same = (r.points[1:] == r.points[:-1]).all(axis=(1, 2))
-    around = np.pad(r.pos, ((1, 1), (0, 0)), mode="edge")
-    moves = np.linalg.norm(around[3:] - around[:-3], axis=1) * r.fps > 3 * _MOVES
+    moves = _moves(r)
     longest = _longest_run(same & moves) / r.fps
     if longest > _FROZEN:
         yield _doubt(
@@ -484,13 +498,15 @@ def _of_motion(r: Recording) -> Iterator[Finding]:
             "Poses that were not seen may be written as numbers. Repair these frames, or leave the sequence out"
             " (xreset demos select --rest).",
         )
-    elif lost := _lost_frame(r.pos, r.fps):
+    elif lost := _lost_frame(r):
         yield _doubt(
             "frozen",
-            f"The object stays exactly where it is for {_FROZEN:g} s or longer, and then jumps, first in frame {lost}.",
+            f"The object's position or orientation does not change at all for {_FROZEN:g} s or longer, and then jumps,"
+            f" first in frame {lost}.",
             "The tracker may have lost it: repair these frames, or leave the sequence out (xreset demos select"
             " --rest).",
         )
+    yield from _doubts_of_tracking(r)
     if r.moved.any() and (r.turn * r.turn[0].inv()).magnitude().max() < _NEVER_TURNS:
         yield _doubt(
             "turn",
@@ -516,19 +532,62 @@ def _returns(path: np.ndarray) -> np.ndarray:
     return np.minimum(step[1:], step[:-1]) - across
 
 
-def _lost_frame(path: np.ndarray, fps: float) -> int:
-    """Return the first frame in which a path [F, 3] goes on with a jump after it did not move at all for a while; 0 if
-    there is none."""
-    step = np.linalg.norm(np.diff(path, axis=0), axis=1)
-    still = 0
-    for frame, length in enumerate(step.tolist(), start=1):
-        if length == 0.0:
-            still += 1
-        elif length > _GOES_ON and still > _FROZEN * fps:
-            return frame
-        else:
-            still = 0
+def _lost_frame(r: Recording) -> int:
+    """Return the first frame in which an object goes on with a jump after its position or its orientation did not
+    change at all for a while; 0 if there is none."""
+    quats = r.turn.as_quat()
+    step = np.linalg.norm(np.diff(r.pos, axis=0), axis=1)
+    angle = (r.turn[1:] * r.turn[:-1].inv()).magnitude()
+    for same, jumps in (
+        (step == 0.0, step > _GOES_ON),
+        ((quats[1:] == quats[:-1]).all(axis=1), angle > _TURNS_ON),
+    ):
+        for frame in np.flatnonzero(jumps).tolist():
+            begin = frame - int(_FROZEN * r.fps) - 1
+            if begin >= 0 and same[begin:frame].all():
+                return frame + 1
     return 0
+
+
+def _doubts_of_tracking(r: Recording) -> Iterator[Finding]:
+    """Yield doubts about an object that trembles, or whose poses repeat while it moves."""
+    quats = r.turn.as_quat()
+    same = (r.pos[1:] == r.pos[:-1]).all(axis=1) & (quats[1:] == quats[:-1]).all(axis=1)
+    moves = _moves(r)
+    if moves.any() and (copies := (same & moves).sum() / moves.sum()) > _COPIES:
+        yield _doubt(
+            "object copies",
+            f"In {copies:.0%} of the frames in which the object moves, its pose is an exact copy of the frame before.",
+            "It may have been recorded at a lower rate: remove the copies, and state the times.",
+        )
+        return
+    place = np.linalg.norm(np.diff(r.pos, n=2, axis=0), axis=1) / np.sqrt(6.0)
+    turn = (r.turn[1:] * r.turn[:-1].inv()).as_rotvec()
+    angle = np.linalg.norm(np.diff(turn, axis=0), axis=1) / np.sqrt(6.0)
+    trembles = []
+    dt = 1.0 / r.fps
+    for values, most, text in (
+        (place, _TREMBLES + _CALM * dt**2, f"{1e3 * np.percentile(place, 25):.0f} mm"),
+        (
+            angle,
+            _TURN_TREMBLES + _TURN_CALM * dt**2,
+            f"{np.degrees(np.percentile(angle, 25)):.0f} degrees",
+        ),
+    ):
+        if np.percentile(values, 25) > most:
+            trembles.append(text)
+    if trembles:
+        yield _doubt(
+            "trembles",
+            f"The object trembles from frame to frame, by {' and '.join(trembles)}.",
+            "Smooth its poses, or look for frames in a wrong order. States with a grasp follow the object exactly.",
+        )
+
+
+def _moves(r: Recording) -> np.ndarray:
+    """[F-1] bool: whether the object moves around a step of its motion."""
+    around = np.pad(r.pos, ((1, 1), (0, 0)), mode="edge")
+    return np.linalg.norm(around[3:] - around[:-3], axis=1) * r.fps > 3 * _MOVES
 
 
 def _step(path: np.ndarray, frame: int) -> float:

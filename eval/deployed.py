@@ -14,7 +14,7 @@ from xreset.geometry.description import load_robot
 from xreset.live.deploy import is_deployed, made_for, with_objects
 from xreset.objects.catalogue import object_names
 from xreset.policy.onnx_policy import METADATA_KEY
-from xreset.policy.shipped import shipped_graphs
+from xreset.policy.shipped import shipped, shipped_graphs
 from xreset.runtime import Controller
 from xreset.runtime.contract import POLICY
 from xreset.spec import ObjectSpec, RobotSpec
@@ -80,6 +80,10 @@ def load_deployed(
             graph = shipped_graphs()[name]
             if robot is None or made_for(graph.read_bytes(), load_robot(robot)):
                 return deployed(graph, robot)
+        elif name in shipped() and not os.path.exists(name):
+            raise PolicyError(
+                f"The policy {name!r} has cameras, so no graph plays it. Choose from: {', '.join(shipped_graphs())}."
+            )
         if file.suffix == ".onnx" and file.is_file() and is_deployed(file.read_bytes()):
             return deployed(file, robot)
     from xreset.eval.policy_spec import PolicySpec, load_policy  # torch

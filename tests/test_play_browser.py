@@ -20,7 +20,7 @@ class InTheBrowser(unittest.TestCase):
 
         cls.browser = Browser(find_chromium())
         cls.addClassCleanup(cls.browser.close)
-        cls.session = Session("nine-objects")
+        cls.session = Session("many-objects")
         cls.addClassCleanup(cls.session.close)
         with redirect_stdout(io.StringIO()):
             cls.page = Page(cls.session, port=8970)

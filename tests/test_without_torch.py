@@ -74,6 +74,20 @@ class WithoutTorchTest(InFolder):
                 self.run_commands(f"export deploy {name} --out on_robot/{name} --object soup")
                 self.assertTrue((self.folder / "on_robot" / name / "policy.onnx").exists())
 
+    def test_policies_are_listed_and_one_with_cameras_is_refused(self):
+        found = self.run_commands("policies")
+        self.assertIn("many-objects-camera: ", found)
+        self.run_blocked(
+            "from xreset.errors import PolicyError\n"
+            "from xreset.eval.play.session import Session\n"
+            "try:\n"
+            "    Session('many-objects-camera')\n"
+            "except PolicyError as error:\n"
+            "    assert 'has cameras' in str(error), error\n"
+            "else:\n"
+            "    raise AssertionError('it plays')\n"
+        )
+
     def test_demonstrations_and_results_are_shown(self):
         write_result(self.folder / "run" / "eval", toy_result(), [], ("a",))
         found = self.run_commands(

@@ -318,7 +318,7 @@ class Session:
             inputs=inputs,
             distance=distance,
             angle=float(turn.magnitude()),
-            success=distance < GOAL_DISTANCE and turn.magnitude() < GOAL_ANGLE,
+            success=bool(distance < GOAL_DISTANCE and turn.magnitude() < GOAL_ANGLE),
         )
         self.history.append(moment)
         if self.away or self._pull is not None or moment.tip_force.any():

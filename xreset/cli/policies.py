@@ -11,7 +11,7 @@ def policies() -> None:
     from xreset.policy import onnx_policy as policy_files
 
     for name, file in shipped().items():
-        contract = policy_files.OnnxPolicy(file).contract
+        contract = policy_files.stated_contract(file)
         about = card(file)
         console.print(f"{name}: {about.about}")
         facts = {

@@ -297,6 +297,16 @@ class OnnxPolicy:
         return outputs
 
 
+def stated_contract(file: Path) -> Contract:
+    """Return the contract of an exported policy without trying it, for which torch is not needed."""
+    with needs("onnxruntime", "play", PolicyError):
+        import onnxruntime
+    options = onnxruntime.SessionOptions()
+    options.log_severity_level = 3
+    metadata = onnxruntime.InferenceSession(file, options).get_modelmeta().custom_metadata_map
+    return parsed_contract(str(file), parse_json(metadata[METADATA_KEY]), metadata.get(VERSION_KEY))
+
+
 def _read_contract(path: Path, metadata: dict[str, str]) -> Contract:
     """Return the contract in an ONNX file's metadata; ``PolicyError`` if there is none, or it is damaged."""
     if METADATA_KEY not in metadata:

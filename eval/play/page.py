@@ -49,11 +49,11 @@ CURVE_FRAME = 0.25
 CURVE_SECONDS = 10.0
 CURVE_POINTS = 120
 """Most points of a curve."""
-LOOK_AT = np.array((0.57, 0.25, 0.2))
+LOOK_AT = np.array((0.57, 0.3, 0.3))
 """Middle of what happens [m]."""
 RIGHT = np.array((0.79, 0.61, 0.0))
 """Direction to the right, seen from the camera."""
-NEAR = 0.85
+NEAR = 1.05
 """Distance of the camera next to that of other pages."""
 BEHIND = 0.2
 """A delay behind the clock from which the page does not try to catch up [s]."""

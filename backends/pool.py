@@ -201,7 +201,9 @@ class PoolBackend(Backend):
         refuse_unknown_options(self.name, world_options, self.world_class, own)
         super().__init__(scene, num_worlds, object_index=object_index, device=device)
         if workers is None:
-            workers = 0 if 1 in (num_worlds, usable_cores()) else usable_cores()
+            workers = min(num_worlds, usable_cores())
+            if workers == 1:
+                workers = 0
         if workers < 0:
             raise WrongValueError(f"workers is {workers}, expected 0 or more")
         layout = layout_of(scene, self.object_index)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -11,6 +11,9 @@ from xreset.backends.rigid import ContactArrays, StateArrays, sum_contacts
 from xreset.physics import Backend
 from xreset.physics.plugins import backend_class
 from xreset.spec import GRAVITY, SceneSpec
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 State = dict[str, np.ndarray]
 """A value in double precision for each field of :class:`~xreset.physics.State`, without the dimension of worlds."""
@@ -103,14 +106,14 @@ class _BatchWorld(World):
     def set_state(self, state: StateArrays) -> None:
         from xreset.physics import State
 
-        self._backend.set_state(State(**self._tensors(state)))
+        self._backend.set_state(State(**{name: self._tensor(state[name]) for name in state}))
 
     def get_state(self) -> StateArrays:
         found = vars(self._backend.state())
         return {name: value[0].cpu().numpy().astype(float) for name, value in found.items()}
 
     def set_joint_targets(self, targets: np.ndarray) -> None:
-        self._backend.set_joint_targets(self._tensors({"targets": targets})["targets"])
+        self._backend.set_joint_targets(self._tensor(targets))
 
     def step(self, n: int) -> None:
         self._backend.step(n)
@@ -121,12 +124,11 @@ class _BatchWorld(World):
         return tip_force, tip_touch, table_force
 
     def set_object_gravity(self, fraction: float) -> None:
-        (value,) = self._tensors({"fraction": np.array(fraction)}).values()
-        self._backend.set_object_gravity(value)
+        self._backend.set_object_gravity(self._tensor(np.array(fraction)))
 
     def set_object_wrench(self, force: np.ndarray, torque: np.ndarray) -> None:
         if "object_wrench" in self._backend.capabilities:
-            self._backend.set_object_wrench(*self._tensors({"f": force, "t": torque}).values())
+            self._backend.set_object_wrench(self._tensor(force), self._tensor(torque))
 
     def set_object_inertia(self, inertia) -> None:
         raise NotImplementedError
@@ -137,11 +139,8 @@ class _BatchWorld(World):
     def close(self) -> None:
         self._backend.close()
 
-    def _tensors(self, values: Mapping[str, np.ndarray]) -> dict:
+    def _tensor(self, value: np.ndarray) -> Tensor:
+        """Return a value of the world as that of all worlds."""
         import torch
 
-        device = self._backend.device
-        found = {}
-        for name, value in values.items():
-            found[name] = torch.as_tensor(value, dtype=torch.float32, device=device)[None]
-        return found
+        return torch.as_tensor(value, dtype=torch.float32, device=self._backend.device)[None]

@@ -24,7 +24,7 @@ from xreset.geometry.surface import Surface, prepared_surface
 
 TRUST = "If the recording is right all the same, add --trust-recordings (in Python: trust=True)."
 """The one way to use what is refused."""
-CONTACT_DISTANCE = 0.020
+_TOUCH = 0.020
 """A human keypoint nearer than this to the object's surface touches it [m]."""
 
 _ONE_POINT = 0.01
@@ -600,15 +600,12 @@ def _longest_run(flags: np.ndarray) -> int:
     return int((ends[1::2] - ends[::2]).max(initial=0))
 
 
-def human_contacts(
-    demos: Demos, surfaces: Mapping[str, Surface], distance: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Find where human hands touch the objects.
+def human_contacts(demos: Demos, surfaces: Mapping[str, Surface]) -> tuple[np.ndarray, np.ndarray]:
+    """Find where human hands touch the objects: where keypoints are nearer than 2 cm to the surface.
 
     Args:
         demos: demonstrations over the table.
         surfaces: surface of every object that the demonstrations name.
-        distance: a keypoint nearer to the surface than this touches it [m].
 
     Returns:
         Contact points [F, 21, 3] in the world, zero where there is no contact, and whether there is one [F, 21].
@@ -620,6 +617,6 @@ def human_contacts(
     for name in demos.object_names:
         rows = object_name == name
         points[rows], touching[rows] = surfaces[name].contacts(
-            keypoints[rows], demos.object_pos[rows], demos.object_quat_wxyz[rows], distance
+            keypoints[rows], demos.object_pos[rows], demos.object_quat_wxyz[rows], _TOUCH
         )
     return points, touching

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from xreset.demos.archive import Demos, rest_on_table
-from xreset.demos.examine import CONTACT_DISTANCE, human_contacts
+from xreset.demos.examine import human_contacts
 from xreset.files.checks import Checked, frozen
 from xreset.files.processes import in_processes
 from xreset.files.progress import Progress, unseen
@@ -172,7 +172,7 @@ class HandMotions:
         _, self._object_index = np.unique(demos.object_name, return_inverse=True)
         self._fields = DistanceFields.join([surface.field for surface in surfaces.values()])
         self.demos = demos = rest_on_table(demos, objects)
-        self._contact_points, self.touching = human_contacts(demos, surfaces, CONTACT_DISTANCE)
+        self._contact_points, self.touching = human_contacts(demos, surfaces)
         """Contact points [F, 21, 3] of the human keypoints, and whether each keypoint [F, 21] touches the object."""
         self._keypoints = np.where(demos.hand_valid[:, None, None], demos.hand_keypoints, 0.0)
 

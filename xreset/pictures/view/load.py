@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from xreset.demos.archive import Demos, ObjectMotions, read_demos, rest_on_table
-from xreset.demos.examine import CONTACT_DISTANCE, examine, human_contacts
+from xreset.demos.examine import examine, human_contacts
 from xreset.errors import XResetError
 from xreset.files.records import stated_doubts
 from xreset.geometry.surface import prepared_surface
@@ -169,7 +169,7 @@ def _human(demos: Demos, objects: Sequence[ObjectSpec]) -> tuple[Demos, dict[str
     surfaces = {
         spec.name: prepared_surface(spec) for spec in objects if spec.name in demos.object_name
     }
-    _, touching = human_contacts(demos, surfaces, CONTACT_DISTANCE)
+    _, touching = human_contacts(demos, surfaces)
     return demos, {"human_keypoints": keypoints, "human_touching": touching}
 
 

@@ -35,6 +35,7 @@ from xreset.backends.mjcf import KNOWN_DIFFERENCES, compile_scene
 from xreset.backends.mjcf_model import MIN_FRICTION
 from xreset.backends.mujoco_warp_setup import (
     announced,
+    compile_kernels,
     contact_room,
     correct_engine,
     differing_fields,
@@ -251,7 +252,7 @@ class MujocoWarpBackend(BatchBackend):
         self._nominal = {name: value.clone() for name, value in nominal.items()}
 
     def _prepare(self) -> None:
-        """Run each sequence of kernels once, which compiles it, then capture it as a graph.
+        """Compile the kernels, run each sequence of them once, then capture it as a graph.
 
         Even on the CPU a graph saves most of the time.
         """
@@ -265,8 +266,13 @@ class MujocoWarpBackend(BatchBackend):
             "begin": (self._write_state, self._write_parameters, kinematics, self._read_motion),
             "parameters": (self._write_parameters, kinematics),
         }
-        for part in chain.from_iterable(sequences.values()):
-            part()
+
+        def run() -> None:
+            for part in chain.from_iterable(sequences.values()):
+                part()
+
+        compile_kernels(self._warp_device, run)
+        run()
         wp.synchronize_device(self._warp_device)
         self._graphs: dict[str, Any] = {}
         # torch's default stream cannot be captured

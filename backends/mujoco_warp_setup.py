@@ -8,12 +8,14 @@ import sys
 import threading
 import warnings
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import fields
 from functools import partial
 from importlib import import_module
 from types import ModuleType
 from typing import Any
+from unittest.mock import patch
 
 import mujoco_warp as mjw
 import numpy as np
@@ -124,11 +126,38 @@ def fill_batched(
         view.copy_(table.view(len(order), *view.shape[1:])[row])
 
 
+def compile_kernels(device: Any, launch: Callable[[], None]) -> int:
+    """Compile the kernels that a function launches, on all cores, and return the number of their modules.
+
+    Warp compiles a module when one of its kernels is launched first, one module after the other: for an H100 that is
+    188 s of one core. The longest module takes 36 s. So the function runs once without launching anything, to find the
+    modules. Loops on the device take one round, because nothing ends them.
+    """
+    found: dict[tuple[Any, int | None], None] = {}
+    this_thread = threading.get_ident()
+    load = wp.Module.load
+
+    def note(module: Any, device: Any, block_dim: int | None = None) -> Any:
+        if threading.get_ident() != this_thread:
+            return load(module, device, block_dim)
+        found[module, block_dim] = None
+        return None  # without a loaded module Warp launches nothing
+
+    def take_one_round(_: Any, while_body: Callable[..., None], **arguments: Any) -> None:
+        while_body(**arguments)
+
+    with patch.object(wp.Module, "load", note), patch.object(wp, "capture_while", take_one_round):
+        launch()
+    with ThreadPoolExecutor() as pool:
+        list(pool.map(lambda each: each[0].load(device, each[1]), found))
+    return len(found)
+
+
 @contextmanager
 def announced(device: Any) -> Iterator[None]:
     """Explain a long wait for kernels to the user."""
     text = (
-        f"mujoco-warp: compiling kernels for {device}, one to three minutes the first time; they are kept in "
+        f"mujoco-warp: compiling kernels for {device}, which takes minutes the first time; they are kept in "
         f"{wp.config.kernel_cache_dir} (set WARP_CACHE_PATH to choose another folder)."
     )
     timer = threading.Timer(_ANNOUNCE_AFTER, print, (text,), {"file": sys.stderr, "flush": True})

@@ -12,6 +12,7 @@ import mujoco
 import mujoco_warp
 import numpy as np
 import torch
+import warp as wp
 from mujoco_warp._src import constraint
 from torch import tensor
 from torch.testing import assert_close
@@ -26,7 +27,7 @@ from xreset.backends.mjcf import compile_scene
 from xreset.backends.mjcf_model import SceneModel
 from xreset.backends.mujoco import MujocoBackend, MujocoWorld
 from xreset.backends.mujoco_warp import MujocoWarpBackend
-from xreset.backends.mujoco_warp_setup import contact_room, differing_fields
+from xreset.backends.mujoco_warp_setup import compile_kernels, contact_room, differing_fields
 from xreset.backends.mujoco_warp_step import (
     constraints,
     finish,
@@ -300,6 +301,23 @@ class Steps(TestCase):
         for other in results[1:]:
             for a, b in zip(results[0], other, strict=True):
                 assert_close(a, b, rtol=0, atol=0)
+
+
+class Kernels(TestCase):
+    def test_a_sequence_is_compiled_without_a_launch(self):
+        @wp.kernel(module="unique")
+        def count_down(left: wp.array[int]):
+            left[0] = left[0] - 1
+
+        def run():
+            wp.capture_while(left, lambda: wp.launch(count_down, 1, [left], device="cpu"))
+
+        left = wp.full(1, 3, dtype=int, device="cpu")
+        self.assertEqual(compile_kernels("cpu", run), 1)
+        self.assertEqual(left.numpy()[0], 3, "nothing is launched")
+        with patch.object(wp.Module, "_compile", side_effect=AssertionError("late")):
+            run()
+        self.assertEqual(left.numpy()[0], 0)
 
 
 class Limits(TestCase):

@@ -42,7 +42,7 @@ CAUSES = {
     "time: hand 200 ms late": "with the hand 200 ms late, both move together",
     "time: hand backwards": "played backwards",
     "time: rate times 5": "Is the rate of 150 frames per second right",
-    "jump: hand by 30 cm": "The hand jumps in 1 frames",
+    "jump: hand by 30 cm": "The hand jumps in 1 of",
 }
 """Words about the likeliest cause of some of the kinds."""
 
@@ -158,7 +158,12 @@ class Wrong(InFolder):
             name: getattr(demos, name)[::-1]
             for name in ("object_pos", "object_quat_wxyz", "hand_keypoints", "hand_valid")
         }
-        for words, changed in (("comes no nearer", still), ("be played backwards", backwards)):
+        tenth = {"object_pos": demos.object_pos / 10}
+        for words, changed in (
+            ("comes no nearer", still),
+            ("be played backwards", backwards),
+            ("their numbers are a tenth of what they should be", tenth),
+        ):
             found = examine(replace(demos, **changed))
             self.assertIn(words, " ".join(map(str, found)), "without a mesh")
 

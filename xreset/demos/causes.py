@@ -56,6 +56,8 @@ _BETTER_TURN = 0.72
 """The same of another order of the quaternions' numbers: 0.76."""
 _BETTER_INVERSE = 0.5
 """The same of inverse orientations: 0.53."""
+_TOGETHER = 0.7
+"""Largest slip in another unit that tells the unit of an object which hardly moves."""
 _STANDS = 0.92
 """The same if it also makes an object stand that would fall over."""
 _KNOWN = 0.35
@@ -340,7 +342,8 @@ def unnoticed_cause(r: Recording) -> str:
     if there is none."""
     slip = r.slip()
     if np.isnan(slip):
-        return ""
+        found = (c.text for c in _units(r) if _fits(c.recording, r, _TOGETHER))
+        return next(found, "")
     for causes, better in (
         (_clocks(r), _BETTER),
         (_orders(r), _BETTER_TURN),

@@ -421,7 +421,7 @@ def _doubts_of_hand(r: Recording, bones: np.ndarray) -> Iterator[Finding]:
     if len(jumps):
         yield _doubt(
             "jumps",
-            f"The hand jumps in {len(jumps)} frames, first in frame {jumps[0]} by"
+            f"The hand jumps in {len(jumps)} of {len(wrist)} frames, first in frame {jumps[0]} by"
             f" {length_text(_step(wrist, jumps[0]))}.",
             "Leave the hand's cells empty in these frames.",
         )

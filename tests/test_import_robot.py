@@ -253,6 +253,22 @@ class Toy(Robots):
             r"'f1_a' has the principal moments 0.1, 0.1, 0.1 .*placeholder.*do not point along x of the palm 'palm_frame'",
         )
 
+    def test_a_thumb_that_bends_behind_the_palm_is_said(self):
+        """Descriptions of left hands that were mirrored from right ones keep axes of the right one."""
+        wrong = HAND.replace(
+            thumb := _finger("thumb"), thumb.replace('xyz="0 1 0"', 'xyz="0 -1 0"')
+        )
+        out = self.imported(wrong, thumb="thumb_a")
+        said = [found.message for found in check(out) if found.level == "warning"]
+        self.assertRegex(" ".join(said), "works on the back of the hand")
+
+    def test_an_arm_that_would_touch_itself_at_home_goes_elsewhere(self):
+        held, moved = homes.hold_near(self.spec, at_home(self.spec, self.spec.hand_root)[0])
+        self.assertEqual(moved, "")
+        with mock.patch.object(homes, "touching_itself", side_effect=[0.5, 0.0]):
+            held, moved = homes.hold_near(held, at_home(held, held.hand_root)[0])
+        self.assertIn("moved by", moved)
+
     def test_mjcf_is_the_same_hand(self):
         mjcf, notes = self.read("hand.xml", MJCF)
         self.assertNotIn("closed loops", notes)

@@ -20,7 +20,7 @@ from xreset.geometry.urdf import RobotTree, load_urdf, mismatches
 from xreset.physics.plugins import robot_folder
 from xreset.retarget.hand.model import HandModel, predicted_gigabytes
 from xreset.robot_tools.draft import link_places
-from xreset.robot_tools.opposition import opposition
+from xreset.robot_tools.opposition import heights_over_palm, opposition
 from xreset.robot_tools.sources import is_solid, largest_moment, plausible
 from xreset.spec import RobotSpec, SceneSpec, TableSpec
 
@@ -306,7 +306,15 @@ def _thumb(spec: RobotSpec) -> Problems:
     def met(tip: int) -> str:
         return ", ".join(names[i] for i in np.flatnonzero(meetings[tip])) or "no other"
 
-    if scores[best] == 0:
+    heights = heights_over_palm(spec)
+    if heights[0] < 0 < heights[1:].min():
+        yield (
+            "warning",
+            f"the thumb {tips[0]!r} works on the back of the hand: at half of its joint positions it is more than "
+            f"{-1e3 * heights[0]:.0f} mm behind the palm, where no other finger is. Its file may have the sign of an "
+            "axis or a limit wrong, as after mirroring a hand; else turn the palm.",
+        )
+    elif scores[best] == 0:
         yield (
             "warning",
             "no fingertip can come near another and press against it. Are the joints' limits right?",
@@ -348,12 +356,18 @@ def _above_table(kinematics: Kinematics, q: torch.Tensor) -> Problems:
     yield level, f"{lowest}; {100 * share:.0f} % of the spread below it"
 
 
-def touching_itself(robot: RobotSpec) -> float:
+def touching_itself(robot: RobotSpec, *, moved_by_arm: bool = False) -> float:
     """Return the share of the joint positions around home, as at the start of episodes, at which a robot touches
-    itself."""
+    itself.
+
+    Args:
+        robot: the robot with its home.
+        moved_by_arm: count only pairs of links whose relative pose depends on an arm joint.
+    """
     kinematics = Kinematics(robot)
     q = _around_home(kinematics)
-    return _share(SelfCollision(kinematics).near(kinematics.link_poses(q).numpy(), 0.0), len(q))
+    collision = SelfCollision(kinematics, moved_by_arm=moved_by_arm)
+    return _share(collision.near(kinematics.link_poses(q).numpy(), 0.0), len(q))
 
 
 def _share(near: Iterable[tuple[int, str, str]], count: int) -> float:

@@ -13,6 +13,7 @@ from xreset.geometry.rotations import matrix_to_quat
 from xreset.retarget.arm.model import ArmModel, ArmTargets
 from xreset.retarget.arm.solve import track
 from xreset.retarget.validity import Thresholds, classify
+from xreset.robot_tools.check import MOST_TOUCHING, touching_itself
 from xreset.robot_tools.draft import rounded
 from xreset.spec import RobotSpec
 
@@ -27,7 +28,7 @@ _CLEAR = 0.10
 def hold_near(robot: RobotSpec, T_world_root: np.ndarray) -> tuple[RobotSpec, str] | None:
     """Return the robot with a home that holds the hand's root at a pose [4, 4], or at the nearest pose next to it.
 
-    A pose with 10 cm of room above the table is preferred.
+    A pose is preferred that has 10 cm of room above the table, and around which the arm rarely touches the robot.
 
     Returns:
         The robot, and where the hand is instead of the wanted pose (empty if it is there); or None if the arm reaches
@@ -45,10 +46,15 @@ def hold_near(robot: RobotSpec, T_world_root: np.ndarray) -> tuple[RobotSpec, st
     if not len(reached):
         return None
     height = table_clearance(model.kinematics, model.full(joints[reached, 0], hand), model.table)
-    chosen = int(reached[(height > _CLEAR).numpy().argmax()])  # the first one, if all are low
+    clear = reached[(height > _CLEAR).numpy()]
+    places = clear if len(clear) else reached
+    for chosen in (*places, places[0]):  # the first one, if the arm touches at all of them
+        held = _with_arm_at(robot, model, joints[chosen, 0].numpy())
+        if touching_itself(held, moved_by_arm=True) <= MOST_TOUCHING:
+            break
     step = (100 * steps[chosen]).tolist()
     moved = f", moved by ({', '.join(f'{value:.0f}' for value in step)}) cm" if any(step) else ""
-    return _with_arm_at(robot, model, joints[chosen, 0].numpy()), moved
+    return held, moved
 
 
 def hold_up(robot: RobotSpec) -> RobotSpec:

@@ -45,11 +45,7 @@ def opposition(robot: RobotSpec, links: Sequence[str], offsets: np.ndarray) -> n
         offsets: [E, 3] fingertips in their links' frames [m].
     """
     kinematics = Kinematics(robot, root=robot.hand_root)
-    generator = torch.Generator().manual_seed(0)
-    draw = torch.rand(
-        _SAMPLES, len(kinematics.joint_names), generator=generator, dtype=torch.float64
-    )
-    q = kinematics.lower + draw * (kinematics.upper - kinematics.lower)
+    q = _random_positions(kinematics)
     ranges = [
         closing_range(*ends)
         for ends in zip(kinematics.lower.tolist(), kinematics.upper.tolist(), strict=True)
@@ -65,3 +61,22 @@ def opposition(robot: RobotSpec, links: Sequence[str], offsets: np.ndarray) -> n
             facing = closing[:, i] @ closing[:, j].T < _FACING
             meetings[i, j] = meetings[j, i] = float((near & facing).double().mean())
     return meetings
+
+
+def heights_over_palm(robot: RobotSpec) -> np.ndarray:
+    """Return how far each fingertip [E] is on the palm's inner side, at the median of random joint positions [m]."""
+    kinematics = Kinematics(robot, root=robot.hand_root)
+    links = [robot.palm, *(tip.link for tip in robot.fingertips)]
+    poses = kinematics.link_poses(_random_positions(kinematics), links).numpy()
+    inner = poses[:, 0, :3, 2]
+    tips = poses[:, 1:, :3, 3] - poses[:, :1, :3, 3]
+    return np.median(np.einsum("fj,fej->fe", inner, tips), axis=0)
+
+
+def _random_positions(kinematics: Kinematics) -> torch.Tensor:
+    """[_SAMPLES, J] joint positions within the limits."""
+    generator = torch.Generator().manual_seed(0)
+    draw = torch.rand(
+        _SAMPLES, len(kinematics.joint_names), generator=generator, dtype=torch.float64
+    )
+    return kinematics.lower + draw * (kinematics.upper - kinematics.lower)

@@ -24,6 +24,9 @@ from tests.fuzzing_commands import commands, draw, outcome_of_command
 GIGABYTES = 6
 """Address space that the process may take in addition to that at its start."""
 
+ROUND = 20
+"""Files of a reader in a round: few, so that a busy machine comes to the last reader as well."""
+
 COMMAND_LINES = "command lines"
 """The name of the commands among the readers."""
 
@@ -41,7 +44,7 @@ def _round(
 
     @seed(number)
     @settings(
-        max_examples=100,
+        max_examples=ROUND,
         deadline=None,
         database=None,
         phases=[Phase.generate],
@@ -68,7 +71,7 @@ def _command_lines(
 ) -> None:
     random = Random(number)
     options = commands()
-    for _ in range(100):
+    for _ in range(ROUND):
         if time.monotonic() > end:
             return
         line = draw(random, options)

@@ -24,6 +24,7 @@ from xreset.geometry.urdf import load_urdf
 from xreset.robot_tools import check as checks
 from xreset.robot_tools import homes
 from xreset.robot_tools.check import check
+from xreset.robot_tools.draft import hand_side
 from xreset.robot_tools.importer import import_robot
 from xreset.robot_tools.sources import bare, read_source
 from xreset.spec import SceneSpec, TableSpec
@@ -172,6 +173,10 @@ class Toy(Robots):
         assert_allclose(in_hand[:3, :3], np.diag((1, -1, -1)), atol=0.06)
         # at home it looks down at the table
         assert_allclose(palm[:3, 2], (0, 0, -1), atol=0.05)
+        self.assertEqual(hand_side(self.spec), "right")
+        thumb, *others = self.spec.fingertips
+        mirrored = replace(self.spec, fingertips=(thumb, *others[::-1]))
+        self.assertEqual(hand_side(mirrored), "left")
 
     def test_home_is_within_the_limits_after_rounding_and_strong_drives_are_stable(self):
         narrow = ARM.replace('lower="-2.9" upper="2.9"', 'lower="0.123446" upper="0.2"')

@@ -379,7 +379,9 @@ class PipelineTest(InOneFolder):
         self.assertIn(words, said)
         said = self.commanded("left", "ur7e-sharpa", "--trust-recordings")
         self.assertIn(words, said)
-        self.assertIn("1 of 1 sequences are of left hands", said)
+        self.assertIn(
+            "1 of 1 sequences are of left hands, but the robot's hand is a right one", said
+        )
         self.assertIn(words, stated_doubts(out)[0])
 
     def test_the_file_says_what_the_robot_does(self):

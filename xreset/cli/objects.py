@@ -114,7 +114,7 @@ def _cells(obj: ObjectSpec) -> tuple[str, ...]:
     return (
         obj.name,
         ycb.ALIAS_OF.get(obj.name, ""),
-        f"{obj.mass:.3f}",
+        f"{obj.mass:.3g}",
         "x".join(f"{1000 * length:.0f}" for length in high - low),
         f"{len(obj.pieces)} {' + '.join(sorted(kinds))}",
     )

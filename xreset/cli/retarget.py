@@ -10,19 +10,23 @@ import numpy as np
 from xreset.cli._common import show_accounts
 from xreset.cli._terminal import console, show_notes
 from xreset.cli._verbs import REQUIRED, verb
+from xreset.geometry.description import load_robot
 from xreset.retarget import verbs
+from xreset.robot_tools.draft import hand_side
 
 if TYPE_CHECKING:
     from xreset.retarget.file import Retargeted
 
 
 def _show(motion: Retargeted, options: Mapping[str, Any]) -> None:
-    left = np.count_nonzero(motion.hand_side == "left")
-    if left:
+    side = hand_side(load_robot(options["robot"]))
+    others = np.count_nonzero(motion.hand_side != side)
+    if side and others:
+        other, remedy = ("left", "--mirror") if side == "right" else ("right", "--side left")
         show_notes(
             [
-                f"{left} of {len(motion.hand_side)} sequences are of left hands. "
-                "For a right hand: xreset demos select --mirror"
+                f"{others} of {len(motion.hand_side)} sequences are of {other} hands, but the robot's hand is a {side} "
+                f"one. Use xreset demos select {remedy}"
             ]
         )
     show_accounts(

@@ -19,7 +19,7 @@ from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.urdf import RobotTree, load_urdf, mismatches
 from xreset.physics.plugins import robot_folder
 from xreset.retarget.hand.model import HandModel, predicted_gigabytes
-from xreset.robot_tools.draft import link_places
+from xreset.robot_tools.draft import hand_side, link_places
 from xreset.robot_tools.opposition import heights_over_palm, opposition
 from xreset.robot_tools.sources import is_solid, largest_moment, plausible
 from xreset.spec import RobotSpec, SceneSpec, TableSpec
@@ -97,8 +97,11 @@ def check(name_or_folder: str | Path) -> list[Finding]:
     kinematics = Kinematics(spec)
     q = _around_home(kinematics)
     found += _topic("drives", _drives(spec), "damping ratios at home are between 0.5 and 5")
+    whose = f"the {hand_side(spec)} palm" if hand_side(spec) else "the palm"
     found += _topic(
-        "frames", _frames(spec, tree), "the palm frame is in the palm, and looks along the fingers"
+        "frames",
+        _frames(spec, tree),
+        f"the palm frame is in {whose}, and looks along the fingers",
     )
     found += _topic(
         "fingers", _fingers(spec, tree), "no fingertip opposes the others more than the thumb"

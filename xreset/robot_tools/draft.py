@@ -83,6 +83,19 @@ def link_places(spec: RobotSpec, positions: dict[str, float]) -> dict[str, np.nd
     return dict(zip(kinematics.link_names, root @ poses, strict=True))
 
 
+def hand_side(spec: RobotSpec) -> str:
+    """Return ``right`` or ``left``, the side of a hand with a thumb and three or more fingers; empty for other hands.
+
+    Seen from the palm's inner side with the fingers up, those of a right hand go from right to left.
+    """
+    if len(spec.fingertips) < 4:
+        return ""
+    places = link_places(spec, {})
+    palm = np.linalg.inv(places[spec.palm])
+    index, last = ((palm @ places[spec.fingertips[i].link])[1, 3] for i in (1, -1))
+    return "right" if last > index else "left"
+
+
 def description_text(spec: RobotSpec, notes: Sequence[str]) -> str:
     """Return the robot's ``robot.toml``, every part explained; ``notes`` say what was guessed."""
     loader = jinja2.FileSystemLoader(Path(__file__).with_name("templates"))

@@ -60,6 +60,7 @@ def commands(folder: Path) -> list[Command]:
     studies = folder / "studies"
     where = ["--engine", "mujoco", "--device", "cpu", "--num-envs", 4]
     resume = ["train", "--out", run, "--resume"]
+    robot = ["--arm", "tests/robots/arm.urdf", "--hand", "tests/robots/hand.xml"]
     watch = [
         "--out",
         eyes,
@@ -142,6 +143,34 @@ def commands(folder: Path) -> list[Command]:
             once=True,
         ),
         Command(
+            "export episodes",
+            ["export", "episodes", run, "--out", folder / "episodes.npz"],
+            folder / "episodes.npz",
+        ),
+        Command(
+            "demos select",
+            ["demos", "select", demos, "--per-object", 1, "--out", folder / "one.npz"],
+            folder / "one.npz",
+        ),
+        Command(
+            "goals",
+            ["goals", "soup", "--robot", "openarm", "--out", folder / "goals.npz"],
+            folder / "goals.npz",
+        ),
+        Command(
+            "objects make",
+            ["objects", "make", "--out", folder / "shapes", "--count", 8],
+            folder / "shapes",
+            once=True,
+        ),
+        Command(
+            "robots import",
+            ["robots", "import", *robot, "--out", folder / "robot"],
+            folder / "robot" / "robot.toml",
+            once=True,
+        ),
+        Command("view", ["view", motion, "--png", folder / "a.png"], folder / "a.png"),
+        Command(
             "study",
             ["study", "seconds", "--out", studies],
             studies / "reports" / "seconds" / "index.html",
@@ -198,11 +227,12 @@ def kill(command: Command, wanted: int, chance: random.Random) -> tuple[int, boo
     good = True
     while killed < wanted and ended < 3:
         remove_if_once(command)
+        began = time.monotonic()
         if attempt(command.arguments, chance.uniform(0.2, seconds)) is None:
             killed += 1
         else:
             ended += 1
-            seconds = max(2.0, 0.7 * seconds)
+            seconds = time.monotonic() - began
         good &= command.saved() >= saved
         saved = command.saved()
     remove_if_once(command)
@@ -212,7 +242,8 @@ def kill(command: Command, wanted: int, chance: random.Random) -> tuple[int, boo
 def remove_if_once(command: Command) -> None:
     """Remove the folder of a command that makes a new one, if it is complete."""
     if command.once and command.result.exists():
-        shutil.rmtree(command.result.parent)
+        result = command.result
+        shutil.rmtree(result if result.is_dir() else result.parent)
 
 
 def attempt(arguments: list, delay: float | None) -> int | None:

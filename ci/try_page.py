@@ -27,8 +27,8 @@ import numpy as np
 from xreset.backends.mjcf import compile_scene, scene_xml
 from xreset.backends.mjcf_model import MOST_BRAKING, SceneModel, body_name
 from xreset.backends.rigid import mechanism
-from xreset.eval.deployed import Deployed, load_deployed
 from xreset.eval.play.session import Session
+from xreset.eval.policy_spec import PolicySpec, load_policy
 from xreset.files.text import short_name
 from xreset.geometry.dynamics import drive_values
 from xreset.geometry.shapes import transformed
@@ -220,7 +220,7 @@ def starts_of(bank: ResetBank) -> list[dict[str, Any]]:
     return rows
 
 
-def scene_of(name: str, policy: Deployed) -> tuple[SceneSpec, dict[str, Any]]:
+def scene_of(name: str, policy: PolicySpec) -> tuple[SceneSpec, dict[str, Any]]:
     """Return the scene that ``xreset play`` plays with an object, and the content of its file."""
     session = Session(policy, object_name=name)
     session.close()
@@ -232,7 +232,7 @@ def scene_of(name: str, policy: Deployed) -> tuple[SceneSpec, dict[str, Any]]:
 
 def write_data(folder: Path, names: Sequence[str]) -> None:
     """Write the robot and the objects of these names."""
-    policy = load_deployed(POLICY)
+    policy = load_policy(POLICY)
     scenes = folder / "scenes"
     scenes.mkdir(parents=True, exist_ok=True)
     for name in names:

@@ -2,28 +2,21 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterable, Sequence
 from functools import cached_property
 from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import torch
-from torch import Tensor
-
-from xreset.env.manipulation import ManipulationEnv, make_env
 from xreset.errors import PolicyError
-from xreset.eval.deployed import deployed, played_objects
 from xreset.files.checks import Checked, Seed, frozen, obeys_rules
 from xreset.files.text import Brief, shown
 from xreset.geometry.description import load_robot
-from xreset.learning.exported import read_policy
-from xreset.learning.run import read_run
-from xreset.live.deploy import deployed_graph, is_deployed, made_for, task_of
-from xreset.live.engine import GraphPolicy
-from xreset.policy.onnx_policy import OnnxPolicy, Policy, RandomPolicy, ZeroPolicy, check_contract
-from xreset.policy.shipped import graph_of, results_folder
+from xreset.learning.exported import PolicyFile, find_policy
+from xreset.live.deploy import deployed_graph, is_deployed, made_for, training_of
+from xreset.objects.catalogue import object_names
+from xreset.policy.onnx_policy import OnnxPolicy, Policy, check_contract, check_robot
+from xreset.policy.shipped import graph_of
 from xreset.resets.bank import ResetBank
 from xreset.retarget.file import Retargeted
 from xreset.runtime import Controller
@@ -31,13 +24,11 @@ from xreset.runtime.contract import POLICY
 from xreset.spec import ObjectSpec, RobotSpec
 from xreset.task.config import TaskConfig, evaluation_task
 
-if TYPE_CHECKING:
-    from tensordict import TensorDict
+if TYPE_CHECKING:  # functions import torch, which playing a deployed policy does not need
+    from xreset.env.manipulation import ManipulationEnv
 
 BASELINES = ("zero", "random", "ik")
 """Names of the policies that need no training."""
-LEAD_IN = 1.0
-"""Time in which the baseline ``ik`` moves from home to the first frame [s]."""
 
 
 @frozen
@@ -88,7 +79,8 @@ class PolicySpec(Brief, Checked):
         Args:
             folder: folder of meshes; None: the stand-ins.
         """
-        return played_objects(self.objects or (), folder)
+        names = object_names(folder)
+        return tuple(name for name in names if name in (self.objects or ())) or names
 
     @obeys_rules
     def make_env(
@@ -111,6 +103,8 @@ class PolicySpec(Brief, Checked):
             device: where the engine runs: cpu or cuda.
             seed: seed of every random number.
         """
+        from xreset.env.manipulation import make_env
+
         return make_env(
             self.robot,
             objects,
@@ -128,11 +122,7 @@ class PolicySpec(Brief, Checked):
         Raises:
             PolicyError: observations or actions have another meaning in this environment.
         """
-        if self.follows_motion:
-            raise PolicyError("The baseline 'ik' follows recorded motion. Use xreset.evaluate.")
         policy = self.start(None)
-        if isinstance(policy, OnnxPolicy):
-            check_contract(self.name, policy.contract, env.backend.scene.robot, env.task)
         policy.begin(env)
         return policy
 
@@ -162,6 +152,11 @@ class PolicySpec(Brief, Checked):
         graph = graph_of(content)
         if graph is not None and made_for(graph, self.robot):
             return graph
+        if self.task.vision.cameras:
+            raise PolicyError(
+                f"The policy {self.name!r} has cameras, so no graph plays it. Choose one that is told the pose."
+            )
+        check_contract(self.name, OnnxPolicy(self.name, content).contract, self.robot, self.task)
         return deployed_graph(content, self.robot, self.task)
 
 
@@ -192,42 +187,25 @@ def load_policy(
         raise PolicyError(
             f"policy is {shown(policy)}, expected a name, a path or a PolicySpec (docs/gymnasium.md)."
         )
-    name = str(policy)
-    if name in BASELINES:
-        return _baseline(name, robot, seed)
-    path = Path(policy)
-    if os.path.isdir(path / "runtime"):  # of xreset export deploy
-        path = path / POLICY
-        policy = path
-    if path.suffix == ".onnx" and path.is_file() and is_deployed(path.read_bytes()):
-        return _deployed(path, robot)
-    run = None
-    if os.path.isdir(path):
-        run = read_run(path)
-    elif path.suffix == ".pt" and path.is_file():
-        run = read_run(path.parent.parent)
-    loaded = read_policy(policy, also=BASELINES)
-    file = loaded.path
-    folder = file.parent
-    if run is not None:
-        name = path.name
-        robot = robot or run.robot
-        if file == path:
-            name = f"{path.parent.parent.name}-{path.stem}"
-            folder = path.with_suffix("")
-    elif file == path:
-        name = path.stem
-    else:
-        folder = results_folder(name)
+    if str(policy) in BASELINES:
+        return _baseline(str(policy), robot, seed)
+    found = find_policy(policy, also=BASELINES)
+    return _deployed(found, robot) if is_deployed(found.content) else _trained(found, robot)
+
+
+def _trained(found: PolicyFile, robot: str | Path | None) -> PolicySpec:
+    """Return a policy that xreset has trained."""
+    loaded = OnnxPolicy(found.path, found.content)
     contract = loaded.contract
-    spec = load_robot(robot or contract.robot)
-    check_contract(str(file), contract, spec, contract.task)
+    run = found.run
+    spec = load_robot(robot or (run.robot if run else contract.robot))
+    check_robot(str(found.path), contract, spec)
     return PolicySpec(
-        name=name,
+        name=found.name,
         start=lambda motion: loaded.another(),
         robot=spec,
         task=contract.task,
-        folder=folder / "eval",
+        folder=found.results / "eval",
         meshes=Path(run.meshes) if run and run.meshes else None,
         objects=contract.objects,
         hash=loaded.hash,
@@ -235,20 +213,33 @@ def load_policy(
     )
 
 
-def _deployed(file: Path, robot: str | Path | None) -> PolicySpec:
+def _deployed(found: PolicyFile, robot: str | Path | None) -> PolicySpec:
     """Return a policy whose file is a graph from readings to joint targets, whoever trained it."""
-    content = file.read_bytes()
-    controller = Controller(content, str(file))
-    found = deployed(file, robot)
+    file = found.path
+    controller = Controller(found.content, str(file))
+    contract = controller.contract
+    spec = load_robot(robot or contract["robot"])
+    names = tuple(joint["name"] for joint in contract["joints"])
+    if names != spec.joint_names:
+        raise PolicyError(
+            f"{file} has the joints {', '.join(names)}, but the robot {spec.name!r} has {', '.join(spec.joint_names)}."
+        )
+
+    def start(motion: Retargeted | None) -> Policy:
+        from xreset.live.engine import GraphPolicy
+
+        return GraphPolicy(Controller(found.content, str(file)))
+
+    trained = training_of(controller, str(file))
     return PolicySpec(
-        name=found.name,
-        start=lambda motion: GraphPolicy(Controller(content, str(file))),
-        robot=found.robot,
-        task=task_of(controller, str(file)),
-        folder=file.parent / "eval",
-        objects=tuple(controller.contract.get("objects", ())),
-        hash=sha256(content).hexdigest(),
-        content=content,
+        name=file.parent.resolve().name if file.name == POLICY else found.name,
+        start=start,
+        robot=spec,
+        task=trained.task,
+        folder=found.results / "eval",
+        objects=tuple(contract.get("objects", ())) or trained.objects,
+        hash=sha256(found.content).hexdigest(),
+        content=found.content,
     )
 
 
@@ -257,52 +248,16 @@ def _baseline(name: str, robot: str | Path | None, seed: int) -> PolicySpec:
         raise PolicyError(f"The baseline {name!r} needs a robot. Name it (robot=... or --robot).")
     spec = load_robot(robot)
 
-    joints = len(spec.joints)
-    makers: dict[str, Callable[..., Policy]] = {
-        "zero": lambda motion: ZeroPolicy(joints),
-        "random": lambda motion: RandomPolicy(joints, seed),
-        "ik": KinematicRetargeting,
-    }
+    def start(motion: Retargeted | None) -> Policy:
+        from xreset.eval import baselines
+
+        if name == "zero":
+            return baselines.ZeroPolicy(len(spec.joints))
+        if name == "random":
+            return baselines.RandomPolicy(len(spec.joints), seed)
+        if motion is None:
+            raise PolicyError("The baseline 'ik' follows recorded motion. Use xreset.evaluate.")
+        return baselines.KinematicRetargeting(motion)
+
     folder = Path("runs") / f"{name}-{spec.name}" / "eval"
-    return PolicySpec(name=name, start=makers[name], robot=spec, task=TaskConfig(), folder=folder)
-
-
-class KinematicRetargeting:
-    """The open-loop baseline (the paper's "Kinematic Retargeting", "IK Oracle"): retargeted motion, played as targets.
-
-    Episodes start at home, so the robot first moves to the first frame in a straight line in joint space. Then it plays
-    the demonstration at its own speed, and holds its last frame. Actions go through the same interface as a policy's.
-    """
-
-    def __init__(self, motion: Retargeted) -> None:
-        """Take motion, in the order of the environment's demonstrations."""
-        self._motion = motion
-
-    def begin(self, env: ManipulationEnv) -> None:
-        """Compute the joint targets [N, steps, J] of the episodes that have just begun."""
-        motion = self._motion
-        dt = env.backend.scene.control_dt
-        lead = max(1, round(LEAD_IN / dt))
-        time = torch.arange(env.max_episode_length) * dt
-        blend = ((torch.arange(len(time)) + 1) / lead).clamp(0, 1)[:, None]
-        plans = []
-        for world, sequence in enumerate(env.sequence.tolist()):
-            first, last = motion.frame_offsets[sequence : sequence + 2]
-            path = torch.as_tensor(motion.joint_pos[first:last], dtype=torch.float32)
-            frame = ((time - lead * dt) * float(motion.fps)).clamp(0, len(path) - 1)
-            before = frame.floor().long().clamp_max(max(len(path) - 2, 0))
-            after = (before + 1).clamp_max(len(path) - 1)
-            share = (frame - before)[:, None]
-            plan = path[before] * (1 - share) + path[after] * share
-            start = env.joint_target[world].cpu()
-            plans.append(start * (1 - blend) + plan * blend)
-        self._plan = torch.stack(plans).to(env.device)
-        self._step = 0
-        self._env = env
-
-    def act(self, observations: TensorDict) -> Tensor:
-        """Return the actions [N, J] that bring the targets nearest to the plan."""
-        env = self._env
-        wanted = self._plan[:, min(self._step, self._plan.shape[1] - 1)]
-        self._step += 1
-        return env.actions.action_for(wanted, env.joint_target)
+    return PolicySpec(name=name, start=start, robot=spec, task=TaskConfig(), folder=folder)

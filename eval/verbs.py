@@ -303,14 +303,14 @@ def export_deploy(
         PolicyError: the policy is a baseline or looks through cameras, or the folder is not empty.
         ObjectError: there is neither a stand-in nor a mesh of an object.
     """
-    from xreset.eval.deployed import load_deployed, played_objects
-    from xreset.live.deploy import write_deployed
+    from xreset.eval.policy_spec import load_policy
+    from xreset.live.deploy import with_objects, write_deployed
     from xreset.objects.catalogue import load_objects
 
-    found = load_deployed(policy, robot)
-    folder = Path(meshes) if meshes else found.meshes
-    listed = load_objects(only or played_objects(found.objects, folder), folder)
-    write_deployed(found.listing(listed), Path(out))
+    spec = load_policy(policy, robot=robot)
+    folder = spec.meshes_folder(meshes)
+    listed = load_objects(only or spec.objects_of(folder), folder)
+    write_deployed(with_objects(spec.graph, listed), Path(out))
     return Path(out)
 
 

@@ -39,10 +39,9 @@ from xreset import (
     synthesize,
 )
 from xreset.errors import PolicyError
-from xreset.eval.deployed import load_deployed
 from xreset.eval.rollout import engine, episode_starts, load_trial, roll_out
 from xreset.live import cache
-from xreset.live.deploy import deployed_graph, write_deployed
+from xreset.live.deploy import deployed_graph, with_objects, write_deployed
 from xreset.live.engine import EngineDriver
 from xreset.live.graph import policy_graph
 from xreset.policy.onnx_policy import OnnxPolicy, policy_contract
@@ -332,7 +331,7 @@ class ToyTest(InFolder):
         (old / "policy.onnx").write_bytes(self.network.read_bytes())
         spec = load_policy(old, robot=self.robot)
         self.assertIsInstance(spec.start(None), OnnxPolicy)
-        contract = Controller(load_deployed(spec).listing([toy_grasp.brick()])).contract
+        contract = Controller(with_objects(spec.graph, [toy_grasp.brick()])).contract
         self.assertEqual(contract, self.contract)
 
     def test_the_example_of_a_driver(self):

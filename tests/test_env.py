@@ -22,6 +22,7 @@ from tests.toy_robot import toy_robot
 from xreset import make_bank
 from xreset.env.manipulation import ManipulationEnv, make_env, make_scene
 from xreset.errors import CapabilityError, XResetError
+from xreset.eval.baselines import KinematicRetargeting, ZeroPolicy
 from xreset.eval.metrics import EpisodeMetrics, MetricPoints
 from xreset.eval.rollout import Engine, Trial, roll_out
 from xreset.geometry.rotations import quat_rotate
@@ -29,7 +30,6 @@ from xreset.learning.recipes import RECIPES
 from xreset.objects.catalogue import load_object, load_objects
 from xreset.physics import State
 from xreset.physics.plugins import backend_status, make_backend
-from xreset.policy.onnx_policy import ZeroPolicy
 from xreset.resets.distribution import ResetDistribution
 from xreset.task.config import (
     ActionConfig,
@@ -777,8 +777,6 @@ class RolloutTest(WithEnv):
 
 class KinematicRetargetingTest(WithEnv):
     def test_plays_the_trajectory_at_its_own_speed_after_moving_there(self):
-        from xreset.eval.policy_spec import KinematicRetargeting
-
         self.robot = replace(self.robot, home_std=(0.0, 0.0))
         env = self.make(evaluation_task(replace(TASK, action=ActionConfig(arm_lead=10.0))))
         lengths = [7, 5, 6]
@@ -792,7 +790,7 @@ class KinematicRetargetingTest(WithEnv):
         retargeted = SimpleNamespace(
             joint_pos=np.concatenate(paths), frame_offsets=np.cumsum([0, *lengths]), fps=30.0
         )
-        self.enterContext(patch("xreset.eval.policy_spec.LEAD_IN", 0.1))  # 6 control steps
+        self.enterContext(patch("xreset.eval.baselines.LEAD_IN", 0.1))  # 6 control steps
         policy = KinematicRetargeting(retargeted)
         policy.begin(env)
         targets = []

@@ -22,6 +22,7 @@ from xreset import robots
 from xreset.cameras.config import FRONT, VisionConfig
 from xreset.cli._terms import take_terms
 from xreset.errors import DemoError, FileFormatError, PolicyError, RunError, XResetError
+from xreset.eval.baselines import RandomPolicy, ZeroPolicy
 from xreset.files.checks import from_dict, merged
 from xreset.geometry.rotations import (
     quat_angle,
@@ -36,8 +37,6 @@ from xreset.learning.config import TASK, TrainConfig
 from xreset.learning.recipes import RECIPES
 from xreset.physics import Contacts, Health, Links, State
 from xreset.policy.onnx_policy import (
-    RandomPolicy,
-    ZeroPolicy,
     check_contract,
     parsed_contract,
     policy_contract,

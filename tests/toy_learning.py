@@ -14,11 +14,11 @@ import torch
 
 from tests import toy_grasp
 from xreset.env.manipulation import ManipulationEnv, make_scene
+from xreset.eval.baselines import RandomPolicy
 from xreset.eval.report.read import read_curves
 from xreset.learning.config import ModelConfig, PpoConfig, TrainConfig
 from xreset.learning.recipes import RECIPES
 from xreset.learning.runner import TrainingRunner
-from xreset.policy.onnx_policy import RandomPolicy
 from xreset.resets.distribution import ResetDistribution
 from xreset.task.config import (
     ActionConfig,

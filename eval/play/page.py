@@ -16,9 +16,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from xreset.errors import XResetError
-from xreset.eval.deployed import RESTS, Deployed
 from xreset.eval.play.record import draw_film, last_moments, write_trace
-from xreset.eval.play.session import Session
+from xreset.eval.play.session import RESTS, Session
 from xreset.eval.plots import COLORS
 from xreset.files.text import short_name
 from xreset.physics.plugins import backend_names, robot_names
@@ -61,9 +60,7 @@ GROWTH = 1.03
 """Size of the goal next to the object, so that a pointer meets the goal first where both are in one place."""
 
 
-def serve(
-    policy: str | Path | Deployed | PolicySpec, *, host: str, port: int, **options: Any
-) -> None:
+def serve(policy: str | Path | PolicySpec, *, host: str, port: int, **options: Any) -> None:
     """Serve a live episode until Ctrl-C; ``options`` are those of :class:`~xreset.eval.play.session.Session`."""
     print("Loading the policy, the object and the engine ...", flush=True)
     session = Session(policy, **options)

@@ -10,7 +10,6 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,14 +17,14 @@ from numpy.typing import ArrayLike
 from xreset.backends.single import SingleWorld
 from xreset.demos.synth import synthesize
 from xreset.errors import XResetError
-from xreset.eval.deployed import Deployed, load_deployed, observation_names
 from xreset.eval.metrics import GOAL_ANGLE, GOAL_DISTANCE
+from xreset.eval.policy_spec import PolicySpec, load_policy
 from xreset.files.checks import frozen
 from xreset.geometry.dynamics import drive_values
 from xreset.geometry.kinematics import on_host
 from xreset.geometry.shapes import turn_of
 from xreset.geometry.urdf import joint_limits
-from xreset.live.deploy import task_of
+from xreset.live.deploy import training_of
 from xreset.objects.catalogue import ALIASES, canonical_name, object_names
 from xreset.objects.rest import rest_height
 from xreset.objects.sampling import center, surface_points
@@ -36,9 +35,8 @@ from xreset.spec import GRAVITY, ObjectSpec, PairFriction, RobotSpec, SceneSpec
 from xreset.task.config import TaskConfig, evaluation_task
 from xreset.task.terminations import out_of_bounds
 
-if TYPE_CHECKING:
-    from xreset.eval.policy_spec import PolicySpec
-
+RESTS = "zero"
+"""Name of the policy of a robot that no policy was trained for: the robot rests."""
 KEPT_SECONDS = 60.0
 """How much of the past a session keeps, for curves, films and traces [s]."""
 STARTS = 8
@@ -125,7 +123,7 @@ class Session:
 
     def __init__(
         self,
-        policy: str | Path | Deployed | PolicySpec = "many-objects",
+        policy: str | Path | PolicySpec = "many-objects",
         *,
         object_name: str | None = None,
         engine: str = "mujoco",
@@ -137,7 +135,8 @@ class Session:
         """Load what is to be played.
 
         Args:
-            policy: as for :func:`~xreset.eval.deployed.load_deployed`.
+            policy: as for :func:`~xreset.eval.policy_spec.load_policy`, without cameras; of the baselines only
+                :data:`RESTS`.
             object_name: name of the object; None: the soup can, or else the first object.
             engine: name of the engine.
             robot: default: the policy's.
@@ -158,7 +157,7 @@ class Session:
     # Choosing ---------------------------------------------------------------------------------------------------------
 
     def choose_policy(
-        self, policy: str | Path | Deployed | PolicySpec, *, robot: str | Path | None = None
+        self, policy: str | Path | PolicySpec, *, robot: str | Path | None = None
     ) -> None:
         """Let another policy act, and begin again. Arguments and errors as for the constructor's."""
         self._open(policy, robot, self.object_name, self.engine)
@@ -190,15 +189,16 @@ class Session:
 
     def _open(
         self,
-        policy: str | Path | Deployed | PolicySpec,
+        policy: str | Path | PolicySpec,
         robot: str | Path | None,
         object_name: str | None,
         engine: str,
     ) -> None:
         """Open a world; where this fails, the session stays as it was."""
-        policy = load_deployed(policy, robot)
-        controller = None if policy.graph is None else Controller(policy.graph, policy.name)
-        folder = self._folder or policy.meshes
+        policy = load_policy(policy, robot=robot)
+        rests = policy.content is None and policy.name == RESTS
+        controller = None if rests else Controller(policy.graph, policy.name)
+        folder = policy.meshes_folder(self._folder)
         if self._demos is None:
             names = object_names(folder)
         else:
@@ -207,8 +207,7 @@ class Session:
         name = canonical_name(object_name or (usual if usual in names else names[0]), names)
         source = self._demos or synthesize([name], STARTS, self._seed, meshes=folder)
         inputs = load_inputs(source, robot=policy.robot, meshes=folder, only=[name])
-        task = TaskConfig() if controller is None else task_of(controller, policy.name)
-        scene = scene_of(policy.robot, inputs.objects[0], task)
+        scene = scene_of(policy.robot, inputs.objects[0], policy.task)
         start, *goal = self._drawn(inputs.bank, scene)
         world = SingleWorld(engine, scene, start)
         if hasattr(self, "world"):
@@ -225,7 +224,7 @@ class Session:
         shapes = {} if controller is None else controller.shapes
         points = shapes.get("object_points", (64, 3))[0]
         self._points = surface_points(scene.objects[0], points)
-        self.inputs = {} if controller is None else observation_names(controller)
+        self.inputs = {} if controller is None else _observation_names(controller)
         self.history: deque[Moment] = deque(maxlen=round(KEPT_SECONDS / self.control_dt))
         self._clear()
 
@@ -465,6 +464,18 @@ class Session:
     def close(self) -> None:
         """Close the engine."""
         self.world.close()
+
+
+def _observation_names(controller: Controller) -> dict[str, slice]:
+    """Return the name of each part of :attr:`Controller.observations`, and its place; none if nobody states them."""
+    layout = training_of(controller, "The policy").observation_layout
+    places = {}
+    begin = 0
+    for group in ("policy", "proprio"):
+        for name, width in layout.get(group, {}).items():
+            places[name] = slice(begin, begin + width)
+            begin += width
+    return places
 
 
 def scene_of(robot: RobotSpec, obj: ObjectSpec, task: TaskConfig) -> SceneSpec:

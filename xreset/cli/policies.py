@@ -8,10 +8,10 @@ from xreset.policy.shipped import card, shipped
 
 def policies() -> None:
     """List the policies that ship with xreset. Every command with a policy argument accepts their names."""
-    from xreset.policy import onnx_policy as policy_files
+    from xreset.policy.onnx_policy import OnnxPolicy
 
     for name, file in shipped().items():
-        contract = policy_files.stated_contract(file)
+        contract = OnnxPolicy(file).contract
         about = card(file)
         console.print(f"{name}: {about.about}")
         facts = {

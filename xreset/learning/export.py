@@ -7,10 +7,10 @@ from pathlib import Path
 import torch
 from tensordict import TensorDict
 
-from xreset.files.storage import check_suffix, file_hash, write_whole
+from xreset.files.storage import check_suffix, file_hash, must_exist, write_whole
 from xreset.learning.checkpoint import must_fit, read_checkpoint
 from xreset.learning.model import ExportedPolicy, PointNetLstmModel, make_actor
-from xreset.learning.run import read_run
+from xreset.learning.run import RunInfo, read_run
 from xreset.policy.onnx_policy import (
     CHECKPOINT_KEY,
     INPUTS,
@@ -68,15 +68,15 @@ def export_checkpoint(checkpoint: str | Path, policy: str | Path) -> None:
         XResetError: the name of the policy does not end in ``.onnx``, or the file cannot be written.
     """
     check_suffix("policy", policy, ".onnx")
-    write_whole(policy, exported_checkpoint(Path(checkpoint)))
+    path = Path(checkpoint)
+    must_exist(path, "checkpoint")
+    write_whole(policy, exported_checkpoint(path, read_run(path.parent.parent)))
 
 
-def exported_checkpoint(checkpoint: Path) -> bytes:
-    """Return the content of the file that :func:`export_checkpoint` writes; errors as there."""
+def exported_checkpoint(checkpoint: Path, run: RunInfo) -> bytes:
+    """Return the content of the file that :func:`export_checkpoint` writes; ``run``: the checkpoint's training."""
     weights = read_checkpoint(checkpoint).policy_state_dict
-    folder = checkpoint.parent.parent
-    run = read_run(folder)
-    shapes = observation_shapes(run.contract, str(folder))
+    shapes = observation_shapes(run.contract, str(checkpoint))
     example = TensorDict(
         {name: torch.zeros(1, *shape) for name, shape in shapes.items()}, batch_size=[1]
     )

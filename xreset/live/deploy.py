@@ -27,6 +27,8 @@ from xreset.runtime import Controller
 from xreset.runtime.contract import KEY, POLICY, SCHEMA, check_contract
 from xreset.spec import ObjectSpec, RobotSpec
 from xreset.task.config import EVALUATION_TIMESTEP, ActionConfig, TaskConfig
+from xreset.task.contract import SCHEMA as TRAINED
+from xreset.task.contract import Contract
 
 if TYPE_CHECKING:
     from torch import nn
@@ -191,28 +193,39 @@ def is_deployed(content: bytes) -> bool:
     return KEY.encode() in content
 
 
-def task_of(controller: Controller, source: str) -> TaskConfig:
-    """Return the task of a deployed policy's training.
+def training_of(controller: Controller, source: str) -> Contract:
+    """Return the contract of a deployed policy's training.
 
     A policy that was not trained by xreset states none. Its task has the policy's rate, and actions that reach every
-    target.
+    target; nobody states what its observations are called.
 
     Args:
         controller: the policy.
         source: its name in messages.
 
     Raises:
-        PolicyError: the stated task is damaged.
+        PolicyError: the stated contract is damaged.
     """
     trained = controller.metadata.get(METADATA_KEY)
     if trained is not None:
         version = controller.metadata.get(VERSION_KEY)
-        return parsed_contract(source, json.loads(trained), version).task
+        return parsed_contract(source, json.loads(trained), version)
     substeps = max(1, round(controller.dt / EVALUATION_TIMESTEP))
     action = ActionConfig(
         arm_step=_ANY, arm_lead=_ANY, hand="relative", hand_step=_ANY, hand_lead=_ANY
     )
-    return TaskConfig(action=action, timestep=controller.dt / substeps, substeps=substeps)
+    stated = controller.contract
+    return Contract(
+        schema=TRAINED,
+        robot=stated["robot"],
+        robot_fingerprint=str(stated.get("robot_fingerprint")),
+        joint_names=tuple(joint["name"] for joint in stated["joints"]),
+        fingertip_names=tuple(stated.get("fingertips", ())),
+        objects=(),
+        observation_layout={},
+        control_dt=controller.dt,
+        task=TaskConfig(action=action, timestep=controller.dt / substeps, substeps=substeps),
+    )
 
 
 def write_deployed(graph: bytes, out: Path) -> None:

@@ -1,7 +1,7 @@
-"""Policies for evaluation: objects that turn observations into actions, world by world.
+"""Policies that turn observations into actions, world by world.
 
 A trained policy is an ONNX file with its contract: robot, joint order, observation layout, action mapping and control
-rate. Running a policy needs neither warp nor rsl-rl.
+rate. Reading a policy needs no torch, and running it neither warp nor rsl-rl.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import json
 from copy import copy
 from dataclasses import asdict, replace
 from hashlib import sha256
+from math import prod
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -23,8 +24,7 @@ from xreset.spec import RobotSpec
 from xreset.task.config import TaskConfig
 from xreset.task.contract import SCHEMA, Contract
 
-if TYPE_CHECKING:  # functions import torch, so that contracts are read without it
-    import torch
+if TYPE_CHECKING:  # functions import torch, so that policies are read without it
     from tensordict import TensorDict
     from torch import Tensor
 
@@ -81,13 +81,33 @@ def contract_metadata(contract: Contract) -> dict[str, str]:
     return {METADATA_KEY: json.dumps(asdict(contract)), VERSION_KEY: code_version()}
 
 
+def check_robot(source: str, contract: Contract, robot: RobotSpec) -> None:
+    """Refuse a policy of another robot; ``PolicyError`` as of :func:`check_contract`."""
+    here = replace(
+        contract,
+        robot=robot.name,
+        robot_fingerprint=robot.fingerprint,
+        joint_names=robot.joint_names,
+        fingertip_names=robot.fingertip_names,
+    )
+    _compare(source, contract, here, robot)
+
+
 def check_contract(source: str, contract: Contract, robot: RobotSpec, task: TaskConfig) -> None:
     """Refuse to run a policy where its observations or actions would mean something else.
 
     Raises:
         PolicyError: a part of the contract differs. The message names the first such part.
     """
-    here = policy_contract(robot, task, ())
+    try:
+        here = policy_contract(robot, task, ())
+    except WrongValueError as error:
+        raise PolicyError(f"The contract of {source}: {error}. Export the policy again.") from error
+    _compare(source, contract, here, robot)
+
+
+def _compare(source: str, contract: Contract, here: Contract, robot: RobotSpec) -> None:
+    """Raise ``PolicyError`` for the first part in which a contract differs from the one of a robot and a task here."""
     if robot.like and contract.robot_fingerprint == robot.like:
         here = replace(here, robot=contract.robot, robot_fingerprint=robot.like)
     use_robot = f"Use the robot {contract.robot!r}."
@@ -154,19 +174,27 @@ def parsed_contract(source: str, contract: Any, version: str | None = None) -> C
     return typed
 
 
-def observation_shapes(contract: Contract, source: str) -> dict[str, tuple[int, ...]]:
-    """Return the shape of one world's observations, by group, in the order of ``TaskConfig.policy_groups``.
+def group_widths(contract: Contract, source: str) -> dict[str, int]:
+    """Return the number of values of one world's observations, by group, in the order of ``TaskConfig.policy_groups``.
 
     Raises:
         PolicyError: the contract, which comes from ``source``, does not state the width of a group.
     """
-    *flat, picture = contract.task.policy_groups
-    if missing := [name for name in flat if name not in contract.observation_layout]:
+    groups = contract.task.policy_groups
+    if missing := [name for name in groups if name not in contract.observation_layout]:
         raise PolicyError(
             f"{source} does not state what it observes of {', '.join(missing)}. Export it again."
         )
-    widths = {name: (sum(contract.observation_layout[name].values()),) for name in flat}
-    return widths | {picture: picture_shape(contract.task)}
+    return {name: sum(contract.observation_layout[name].values()) for name in groups}
+
+
+def observation_shapes(contract: Contract, source: str) -> dict[str, tuple[int, ...]]:
+    """Return the shape of one world's observations, by group; errors as of :func:`group_widths`."""
+    shapes: dict[str, tuple[int, ...]] = {}
+    for name, width in group_widths(contract, source).items():
+        shapes[name] = (width,)
+    shapes[contract.task.policy_groups[-1]] = picture_shape(contract.task)
+    return shapes
 
 
 def picture_shape(task: TaskConfig) -> tuple[int, ...]:
@@ -174,6 +202,17 @@ def picture_shape(task: TaskConfig) -> tuple[int, ...]:
     from xreset.task.observations import cloud_shape
 
     return task.vision.view_shape if task.vision.cameras else cloud_shape(task.observation)
+
+
+def policy_content(path: Path) -> bytes:
+    """Return the content of a policy's file; ``PolicyError`` if there is none, or it is too large."""
+    if not path.is_file():
+        raise PolicyError(f"There is no policy file {path}.")
+    if path.stat().st_size > max_bytes():
+        raise PolicyError(
+            f"{path} has {path.stat().st_size >> 20} MB, more than XRESET_MAX_FILE_MB allows."
+        )
+    return path.read_bytes()
 
 
 class OnnxPolicy:
@@ -185,7 +224,6 @@ class OnnxPolicy:
         contract: see :func:`policy_contract`.
         content: content of the file.
         hash: SHA-256 of the content.
-        checkpoint: SHA-256 of the checkpoint that it was exported from; None: it states none.
     """
 
     def __init__(self, path: str | Path, content: bytes | None = None) -> None:
@@ -200,12 +238,8 @@ class OnnxPolicy:
         """
         path = Path(path)
         self.path = path
-        if content is None and not path.is_file():
-            raise PolicyError(f"There is no policy file {path}.")
-        if content is None and path.stat().st_size > max_bytes():
-            raise PolicyError(
-                f"{path} has {path.stat().st_size >> 20} MB, more than XRESET_MAX_FILE_MB allows."
-            )
+        self.content = policy_content(path) if content is None else content
+        self.hash = sha256(self.content).hexdigest()
         with needs("onnxruntime", "eval", PolicyError):
             import onnxruntime
         options = onnxruntime.SessionOptions()
@@ -213,8 +247,6 @@ class OnnxPolicy:
         # Otherwise onnxruntime's threads spin between the steps, which costs as much as the physics.
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         try:
-            self.content = path.read_bytes() if content is None else content
-            self.hash = sha256(self.content).hexdigest()
             self._session = onnxruntime.InferenceSession(
                 self.content,
                 options,
@@ -224,7 +256,6 @@ class OnnxPolicy:
             metadata = self._session.get_modelmeta().custom_metadata_map
         except Exception as error:
             raise PolicyError(_why_unreadable(path, error)) from error
-        self.checkpoint = metadata.get(CHECKPOINT_KEY)
         self.contract = _read_contract(path, metadata)
         self._state: list[np.ndarray] | None = None
         self._try_step(path)
@@ -232,14 +263,19 @@ class OnnxPolicy:
 
     def _try_step(self, path: Path) -> None:
         """Take one step with zeros, so that a policy that cannot act is refused before work begins."""
-        import torch
-
-        observed = observation_shapes(self.contract, str(path))
+        *flat, picture = group_widths(self.contract, str(path)).values()
         worlds = 2
-        zeros = {name: torch.zeros(worlds, *shape) for name, shape in observed.items()}
         try:
-            self._lstm_dim: int = self._session.get_inputs()[2].shape[2]
-            outputs = self._outputs(zeros)
+            inputs = self._session.get_inputs()
+            shape = inputs[1].shape[1:]
+            if prod(shape) != picture:
+                raise ValueError(
+                    f"its picture is {shape}, and the contract states {picture} numbers"
+                )
+            self._lstm_dim: int = inputs[2].shape[2]
+            outputs = self._outputs(
+                np.zeros((worlds, sum(flat)), np.float32), np.zeros((worlds, *shape), np.float32)
+            )
             found = [f"{value.dtype} {value.shape}" for value in outputs]
         except Exception as error:
             raise PolicyError(
@@ -264,47 +300,40 @@ class OnnxPolicy:
         return policy
 
     def begin(self, env: ManipulationEnv) -> None:
-        """Zero the recurrent state."""
+        """Zero the recurrent state.
+
+        Raises:
+            PolicyError: observations or actions have another meaning in this environment.
+        """
+        check_contract(str(self.path), self.contract, env.backend.scene.robot, env.task)
         self._state = None
 
-    def act(self, observations: TensorDict) -> Tensor:
+    def act(self, observations: TensorDict | dict[str, Tensor]) -> Tensor:
         """[N, J] mean action, on the observations' device."""
         import torch
 
-        actions, *state = self._outputs(observations)
-        self._state = [np.array(value) for value in state]
-        device = observations["proprio"].device
-        return torch.as_tensor(actions, device=device).clamp(-1.0, 1.0)
-
-    def _outputs(self, observations: TensorDict | dict[str, Tensor]) -> list[np.ndarray]:
-        """Return the graph's outputs: actions [N, J] without limits, and the LSTM's next state."""
-        import torch
-
-        groups = self.contract.task.policy_groups
-        for name in groups:
+        values = []
+        for name in self.contract.task.policy_groups:
             value = observations.get(name, None)
             if not isinstance(value, torch.Tensor) or value.dim() < 2:
                 raise PolicyError(
                     f"observations[{name!r}] is {shown(value)}, expected a tensor [N, ...] of env.get_observations()."
                 )
-        *flat_groups, picture = groups
-        flat = torch.cat([observations[name] for name in flat_groups], dim=-1)
+            values.append(value)
+        *flat, picture = values
+        joined = torch.cat(flat, dim=-1)
+        actions, *state = self._outputs(joined.cpu().numpy(), picture.cpu().numpy())
+        self._state = [np.array(value) for value in state]
+        return torch.as_tensor(actions, device=joined.device).clamp(-1.0, 1.0)
+
+    def _outputs(self, flat: np.ndarray, picture: np.ndarray) -> list[np.ndarray]:
+        """Return the graph's outputs: actions [N, J] without limits, and the LSTM's next state."""
         shape = (1, len(flat), self._lstm_dim)
         if self._state is None or self._state[0].shape != shape:
             self._state = [np.zeros(shape, dtype=np.float32) for _ in range(2)]
-        values = (flat.cpu().numpy(), observations[picture].cpu().numpy(), *self._state)
-        outputs: Any = self._session.run(OUTPUTS, dict(zip(INPUTS, values, strict=True)))
+        values = dict(zip(INPUTS, (flat, picture, *self._state), strict=True))
+        outputs: Any = self._session.run(OUTPUTS, values)
         return outputs
-
-
-def stated_contract(file: Path) -> Contract:
-    """Return the contract of an exported policy without trying it, for which torch is not needed."""
-    with needs("onnxruntime", "play", PolicyError):
-        import onnxruntime
-    options = onnxruntime.SessionOptions()
-    options.log_severity_level = 3
-    metadata = onnxruntime.InferenceSession(file, options).get_modelmeta().custom_metadata_map
-    return parsed_contract(str(file), parse_json(metadata[METADATA_KEY]), metadata.get(VERSION_KEY))
 
 
 def _read_contract(path: Path, metadata: dict[str, str]) -> Contract:
@@ -319,14 +348,7 @@ def _read_contract(path: Path, metadata: dict[str, str]) -> Contract:
         raise PolicyError(
             f"{path} holds a contract that is not valid JSON ({error}). Export it again."
         ) from error
-    typed = parsed_contract(str(path), contract, metadata.get(VERSION_KEY))
-    from xreset.task.observations import Observer
-
-    try:
-        Observer(typed.task.observation)
-    except WrongValueError as error:
-        raise PolicyError(f"The contract of {path}: {error}. Export the policy again.") from error
-    return typed
+    return parsed_contract(str(path), contract, metadata.get(VERSION_KEY))
 
 
 def _why_unreadable(path: Path, error: Exception) -> str:
@@ -340,33 +362,3 @@ def _why_unreadable(path: Path, error: Exception) -> str:
     if path.suffix != ".onnx":
         return f"{path} is not an exported policy, expected {expected}."
     return f"{path} cannot be read as an ONNX policy: {shown(str(error))}. Is it damaged?"
-
-
-class ZeroPolicy(Policy):
-    """Action zero: the arm stays, the hand moves to its targets under action zero. A baseline and a smoke test."""
-
-    def __init__(self, num_actions: int) -> None:
-        self._num_actions = num_actions
-
-    def act(self, observations: TensorDict) -> Tensor:
-        """[N, J] zeros."""
-        flat = observations["policy"]
-        return flat.new_zeros(len(flat), self._num_actions)
-
-
-class RandomPolicy(Policy):
-    """Uniform actions in [-1, 1], the same for the same seed in every engine."""
-
-    def __init__(self, num_actions: int, seed: int) -> None:
-        self._num_actions = num_actions
-        import torch
-
-        self._generator: torch.Generator = torch.Generator().manual_seed(seed)
-
-    def act(self, observations: TensorDict) -> Tensor:
-        """[N, J] uniform."""
-        import torch
-
-        flat = observations["policy"]
-        share = torch.rand(len(flat), self._num_actions, generator=self._generator)
-        return (2.0 * share - 1.0).to(flat.device)

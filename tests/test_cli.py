@@ -129,6 +129,7 @@ class UsageTest(TestCase):
             (r"--minutes is not a number", "train --out x --minutes nan"),
             (r"Unknown device 'quantum'. Expected cpu, cuda or", "train --out x --device quantum"),
             (r"(File name too long|there is no)", "demos select " + "x" * 300),
+            (r"there is nothing to report\. Give run folders", "report --robot openarm"),
             (r"--png is x\.xyz, expected a name that ends in \.png", "view d.npz --png x.xyz"),
             (r"--mp4 is x, expected a name that ends in \.mp4", "view d.npz --mp4 x"),
             (r"--picture is x\.jpg, expected", "robots check openarm --picture x.jpg"),

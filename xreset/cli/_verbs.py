@@ -61,8 +61,9 @@ def verb(
     def command(**given: Any) -> None:
         arguments = {}
         for name, value in given.items():
-            if value != ():  # of a sequence: the function has its own default
-                arguments[names[name]] = value
+            argument = parameters[names[name]]
+            if value != () or argument.default is REQUIRED:  # else the function has its own
+                arguments[argument.name] = value
         if prepare is not None:
             prepare(arguments)
         if "note" in hints:

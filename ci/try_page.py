@@ -44,7 +44,6 @@ from xreset.pictures.meshes import (
     rgb,
     shade_smoothly,
 )
-from xreset.policy.shipped import shipped_graphs
 from xreset.resets.bank import ResetBank
 from xreset.spec import ObjectSpec, RobotSpec, SceneSpec
 
@@ -255,7 +254,7 @@ def write_data(folder: Path, names: Sequence[str]) -> None:
 
 def write_policy(folder: Path) -> None:
     """Write the policy as one graph from readings to joint targets."""
-    shutil.copy(shipped_graphs()[POLICY], folder / "policy.onnx")
+    (folder / "policy.onnx").write_bytes(load_policy(POLICY).graph)
 
 
 def build(folder: Path, names: Sequence[str]) -> None:

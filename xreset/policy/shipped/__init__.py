@@ -1,11 +1,12 @@
 """Trained policies that ship with xreset: ``NAME.onnx`` in this folder, the card ``NAME.toml``, and the deployed graph
-``graphs/NAME.onnx``.
+without its weights, ``NAME.graph``.
 
 The command line knows such a policy as NAME.
 """
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 from xreset.files.checks import from_dict, frozen
@@ -37,17 +38,25 @@ def shipped() -> dict[str, Path]:
 
 
 def shipped_graphs() -> dict[str, Path]:
-    """Name -> file of the deployed graph (``docs/live.md``) of every such policy without cameras.
+    """Name -> file with the deployed graph (``docs/live.md``) of every such policy without cameras.
 
-    ``ci/ship_graphs.py`` writes these files."""
-    return {file.stem: file for file in sorted((FOLDER / "graphs").glob("*.onnx"))}
+    The weights are cut out of a graph, because the policy's own file has them. A line of JSON lists the cuts: where in
+    the rest a piece was, and its offset and length in the policy's file. The rest follows. ``ci/ship_graphs.py`` writes
+    these files."""
+    return {file.stem: file for file in sorted(FOLDER.glob("*.graph"))}
 
 
 def graph_of(network: bytes) -> bytes | None:
     """Return the deployed graph of an exported policy's content; None if it does not ship with xreset."""
     for name, file in shipped_graphs().items():
         if (FOLDER / f"{name}.onnx").read_bytes() == network:
-            return file.read_bytes()
+            cuts, _, rest = file.read_bytes().partition(b"\n")
+            pieces = []
+            end = 0
+            for at, offset, length in json.loads(cuts):
+                pieces += [rest[end:at], network[offset : offset + length]]
+                end = at
+            return b"".join([*pieces, rest[end:]])
     return None
 
 

@@ -8,18 +8,21 @@ import unittest
 from importlib.util import find_spec
 
 import numpy as np
+import torch
 from numpy.testing import assert_allclose
 
 from xreset import OnnxPolicy, evaluate, synthesize
 from xreset.eval.policy_spec import BASELINES, load_policy
 from xreset.live.deploy import deployed_graph
 from xreset.objects.catalogue import object_names
+from xreset.policy.onnx_policy import observation_shapes
 from xreset.policy.shipped import card, graph_of, shipped, shipped_graphs
 from xreset.runtime import Controller, Reading
 
 LARGEST = 5e6
-LARGEST_GRAPH = 2e5
 """What a policy may add to every download [bytes]."""
+LARGEST_GRAPH = 2e5
+"""The same of its deployed graph without weights."""
 FLOOR = 0.6
 """Mean task progress of the episodes below; an object that is grasped and lifted makes 0.66."""
 
@@ -106,6 +109,24 @@ class ShippedPolicyTest(unittest.TestCase):
                 assert_allclose(shipped_one.observations, fresh.observations, rtol=0, atol=1e-5)
         for name in without_graph:
             self.assertTrue(load_policy(name).task.vision.cameras, name)
+
+    @unittest.skipUnless(find_spec("onnx"), "onnx is not installed")
+    def test_half_precision_changes_its_actions_little(self):
+        content = shipped()["many-objects"].read_bytes()
+        from ci.ship_policies import halved  # needs onnx
+
+        half = halved(content)
+        self.assertLess(len(half), 0.6 * len(content))
+        generator = torch.Generator().manual_seed(0)
+        policies = [OnnxPolicy("policy", each) for each in (content, half)]
+        observations = {
+            name: torch.randn(8, *shape, generator=generator)
+            for name, shape in observation_shapes(policies[0].contract, "policy").items()
+        }
+        for _ in range(3):
+            whole, rounded = (policy.act(observations) for policy in policies)
+            self.assertGreater(whole.abs().max(), 0.1)
+            assert_allclose(rounded, whole, rtol=0, atol=0.02)
 
     def test_it_still_grasps_and_lifts(self):
         for name, file in shipped().items():

@@ -40,9 +40,9 @@ def shipped() -> dict[str, Path]:
 def shipped_graphs() -> dict[str, Path]:
     """Name -> file with the deployed graph (``docs/live.md``) of every such policy without cameras.
 
-    The weights are cut out of a graph, because the policy's own file has them. A line of JSON lists the cuts: where in
-    the rest a piece was, and its offset and length in the policy's file. The rest follows. ``ci/ship_graphs.py`` writes
-    these files."""
+    ``ci/ship_policies.py`` writes these files. The weights are cut out of a graph, because the policy's own file has
+    them. A line of JSON lists the cuts: where in the rest a piece was, and its offset and length in the policy's file.
+    The rest follows."""
     return {file.stem: file for file in sorted(FOLDER.glob("*.graph"))}
 
 

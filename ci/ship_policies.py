@@ -1,0 +1,81 @@
+"""Writes the files of the policies that ship with xreset: ci/ship_policies.py [NAME=RUN ...]
+
+Without arguments it writes the deployed graphs, which is needed after the code of observations or actions has changed.
+NAME=RUN adds the policy of a run before, or replaces it, with its large weights in half precision. Measure the file
+that ships, and write its card. Graphs have the contract of the training that the policy's own file states.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+
+import numpy as np
+import onnx
+from onnx import helper, numpy_helper
+
+from xreset.eval.policy_spec import load_policy
+from xreset.live.deploy import with_metadata
+from xreset.policy.onnx_policy import METADATA_KEY, VERSION_KEY
+from xreset.policy.shipped import FOLDER, shipped
+
+SMALL = 1024
+"""Pieces of fewer bytes stay in the graph."""
+LARGE = 100_000
+"""Weights of more bytes are stored in half precision."""
+
+
+def halved(content: bytes) -> bytes:
+    """Return an exported policy with its large weights in half precision; it computes in single precision."""
+    model = onnx.load_from_string(content)
+    graph = model.graph
+    for constant in list(graph.initializer):
+        value = numpy_helper.to_array(constant)
+        if value.dtype != np.float32 or value.nbytes < LARGE:
+            continue
+        name = f"{constant.name}_float16"
+        half = numpy_helper.from_array(value.astype(np.float16), name)
+        cast = helper.make_node("Cast", [name], [constant.name], to=onnx.TensorProto.FLOAT)
+        graph.initializer.remove(constant)
+        graph.initializer.append(half)
+        graph.node.insert(0, cast)
+    onnx.checker.check_model(model)
+    return model.SerializeToString()
+
+
+def without_weights(graph: bytes, network: bytes) -> bytes:
+    """Return a graph without the weights that are in its network's file too, as
+    :func:`xreset.policy.shipped.shipped_graphs` describes it."""
+    cuts = []
+    rest = []
+    end = 0
+    for constant in onnx.load_from_string(graph).graph.initializer:
+        weights = constant.raw_data
+        at = graph.find(weights, end)
+        offset = network.find(weights)
+        if len(weights) < SMALL or at < 0 or offset < 0:
+            continue
+        rest.append(graph[end:at])
+        cuts.append((sum(map(len, rest)), offset, len(weights)))
+        end = at + len(weights)
+    rest.append(graph[end:])
+    return json.dumps(cuts).encode() + b"\n" + b"".join(rest)
+
+
+def main() -> None:
+    for argument in sys.argv[1:]:
+        name, _, run = argument.partition("=")
+        (FOLDER / f"{name}.onnx").write_bytes(halved(load_policy(run).exported()))
+    for name, file in shipped().items():
+        policy = load_policy(file)
+        if policy.task.vision.cameras:
+            continue
+        stated = {entry.key: entry.value for entry in onnx.load(file).metadata_props}
+        own = {key: stated[key] for key in (METADATA_KEY, VERSION_KEY) if key in stated}
+        graph = with_metadata(policy.graph, own)
+        file.with_suffix(".graph").write_bytes(without_weights(graph, file.read_bytes()))
+        print(name)
+
+
+if __name__ == "__main__":
+    main()

@@ -8,6 +8,7 @@ from itertools import product
 import numpy as np
 import torch
 
+from xreset.files.checks import frozen
 from xreset.geometry.collision import table_clearance
 from xreset.geometry.rotations import matrix_to_quat
 from xreset.retarget.arm.model import ArmModel, ArmTargets
@@ -34,9 +35,33 @@ def hold_near(robot: RobotSpec, T_world_root: np.ndarray) -> tuple[RobotSpec, st
         The robot, and where the hand is instead of the wanted pose (empty if it is there); or None if the arm reaches
         no pose.
     """
-    model = ArmModel(robot)
     steps = torch.tensor(list(product(_STEPS, _STEPS, _STEPS)), dtype=torch.float64)
     steps = steps[steps.norm(dim=1).argsort(stable=True)]
+    found = _held_at(robot, T_world_root, steps[:1])
+    if found is None or not found.is_free:  # the others take time
+        found = _held_at(robot, T_world_root, steps)
+    if found is None:
+        return None
+    step = (100 * steps[found.place]).tolist()
+    moved = f", moved by ({', '.join(f'{value:.0f}' for value in step)}) cm" if any(step) else ""
+    return found.robot, moved
+
+
+@frozen
+class _Held:
+    """A home that holds the hand at one of some places."""
+
+    robot: RobotSpec
+    place: int
+    """Index of the place."""
+    is_free: bool
+    """Whether the arm is clear of the table and of itself there."""
+
+
+def _held_at(robot: RobotSpec, T_world_root: np.ndarray, steps: torch.Tensor) -> _Held | None:
+    """Return the robot with a home at the first place, of the pose [4, 4] moved by steps [S, 3], that is free; if there
+    is none, at the first place that the arm reaches."""
+    model = ArmModel(robot)
     root = torch.as_tensor(T_world_root)
     hand = torch.as_tensor(robot.home[model.hand.joint_indices])
     quat = matrix_to_quat(root[:3, :3]).expand(len(steps), 4)
@@ -48,13 +73,12 @@ def hold_near(robot: RobotSpec, T_world_root: np.ndarray) -> tuple[RobotSpec, st
     height = table_clearance(model.kinematics, model.full(joints[reached, 0], hand), model.table)
     clear = reached[(height > _CLEAR).numpy()]
     places = clear if len(clear) else reached
-    for chosen in (*places, places[0]):  # the first one, if the arm touches at all of them
-        held = _with_arm_at(robot, model, joints[chosen, 0].numpy())
+    for place in places:
+        held = _with_arm_at(robot, model, joints[place, 0].numpy())
         if touching_itself(held, moved_by_arm=True) <= MOST_TOUCHING:
-            break
-    step = (100 * steps[chosen]).tolist()
-    moved = f", moved by ({', '.join(f'{value:.0f}' for value in step)}) cm" if any(step) else ""
-    return held, moved
+            return _Held(robot=held, place=int(place), is_free=len(clear) > 0)
+    held = _with_arm_at(robot, model, joints[places[0], 0].numpy())
+    return _Held(robot=held, place=int(places[0]), is_free=False)
 
 
 def hold_up(robot: RobotSpec) -> RobotSpec:

@@ -7,7 +7,7 @@ import tarfile
 import tempfile
 from dataclasses import replace
 from pathlib import Path
-from unittest import SkipTest, mock
+from unittest import SkipTest, TestCase, mock
 
 import numpy as np
 from numpy.testing import assert_allclose
@@ -15,6 +15,7 @@ from torch import tensor
 
 from tests.command import succeeds
 from tests.data import DEFAULT, InFolder
+from tests.test_robots import BUILT_IN
 from tests.toy_robot import ROBOTS
 from xreset import load_object, load_robot, make_backend
 from xreset.errors import BackendUnavailableError, RobotError
@@ -66,6 +67,11 @@ def _hand(*fingers):
 HAND = _hand(*map(_finger, _PLACES))
 
 ARM = (ROBOTS / "arm.urdf").read_text()
+_MOUNT = """<joint name="mount" type="fixed"><parent link="l5"/><child link="hand_base"/>
+  <origin rpy="0 -1.5708 0"/></joint>"""
+_FINGERS = HAND.replace('"base"', '"hand_base"').partition(">")[2]
+WHOLE = ARM.replace("</robot>", _MOUNT + _FINGERS)
+"""Arm and hand in one file."""
 MJCF = (ROBOTS / "hand.xml").read_text()
 """The same hand, but for one actuator."""
 _AXES = ("1 0 0", "0 1 0", "0 0 1")
@@ -616,10 +622,8 @@ class Toy(Robots):
     def test_arm_and_hand_in_one_file_are_the_same_robot(self):
         mount = load_urdf(self.sources / "mine" / "robot.urdf").joint("hand_base_fixed")
         assert_allclose(mount.T_parent_joint[:3, 3], (0, 0, 0), atol=1e-9)
-        fixed = f"""<joint name="mount" type="fixed"><parent link="{mount.parent}"/><child link="hand_base"/>
-          <origin rpy="0 -1.5708 0"/></joint>"""
-        fingers = HAND.replace('"base"', '"hand_base"').partition(">")[2]
-        whole = self.file("whole.urdf", ARM.replace("</robot>", fixed + fingers))
+        self.assertEqual(mount.parent, "l5")
+        whole = self.file("whole.urdf", WHOLE)
         said = succeeds("robots", "import", "--hand", whole, "--out", self.folder / "mine")
         spec = load_robot(self.folder / "mine")
         for field in ("joint_names", "mimics", "fingertips", "keypoints"):
@@ -741,6 +745,12 @@ class Toy(Robots):
         with self.assertRaisesRegex(RobotError, "is there already"):
             import_robot(self.arm, self.hand, self.folder / "taken")
         self.assertEqual({path.name for path in self.folder.iterdir()}, {"hand.urdf", "taken"})
+
+
+class BuiltIn(TestCase):
+    def test_check_finds_nothing(self):
+        for name in BUILT_IN:
+            self.assertEqual({finding.level for finding in check(name)}, {"ok"}, name)
 
 
 class Published(Robots):

@@ -1,4 +1,4 @@
-"""Two processes train together on the CPU, as ``torchrun`` starts them; and what a process finds out about itself."""
+"""Two processes train together on the CPU, job scripts start them, and what a process finds out about itself."""
 
 import os
 import re
@@ -13,8 +13,8 @@ from unittest import SkipTest, TestCase, mock
 import torch
 from torch.testing import assert_close
 
+from tests.data import InFolder
 from tests.toy_training import WithBank
-from xreset.learning.checkpoint import read_checkpoint
 from xreset.learning.distributed import Processes
 from xreset.learning.recipes import starting_config
 from xreset.learning.run import checkpoints
@@ -38,25 +38,24 @@ class TwoProcesses(WithBank):
         super().setUpClass()
         cls.out = cls.folder / "run"
         new = f"--robot openarm --resets {cls.bank} --engine mujoco --device cpu --num-envs 8 --seed 3"
-        cls.first = cls.train(f"--out {cls.out} --iterations 2 {new} {SMALL}")
-        cls.made = sorted(path.name for path in cls.out.rglob("*") if path.is_file())
-        cls.second = cls.train(f"--out {cls.out} --iterations 3 --resume")
-
-    @classmethod
-    def train(cls, arguments):
-        """What the two processes end with."""
-        torchrun = "-m torch.distributed.run --standalone --nproc-per-node 2 tests/train_worker.py"
-        command = [sys.executable, *torchrun.split(), str(cls.folder), *arguments.split()]
+        first = f"--out {cls.out} --iterations 2 {new} {SMALL}"
+        second = f"--out {cls.out} --iterations 40 --resume"
+        command = [sys.executable, "tests/train_worker.py", str(cls.folder), first, second]
         environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
         done = subprocess.run(
             command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=900
         )
         if done.returncode:
-            raise AssertionError(
-                f"torchrun ended with {done.returncode}:\n{done.stdout}\n{done.stderr}"
-            )
+            raise AssertionError(f"it ended with {done.returncode}:\n{done.stdout}\n{done.stderr}")
         cls.output = done.stdout
-        return [torch.load(cls.folder / f"{rank}.pt", weights_only=True) for rank in (0, 1)]
+        cls.first = cls.ends("first")
+        cls.second = cls.ends("second")
+
+    @classmethod
+    def ends(cls, name):
+        """What the two processes of a training end with."""
+        files = [cls.folder / f"{name}-{rank}.pt" for rank in (0, 1)]
+        return [torch.load(file, weights_only=True) for file in files]
 
     def test_both_learn_the_same_from_other_episodes(self):
         for one, two in (self.first, self.second):
@@ -89,13 +88,16 @@ class TwoProcesses(WithBank):
             assert_close(end["start_success_rate"], one["success_rate"], rtol=0, atol=0)
 
     def test_the_main_process_alone_writes(self):
-        self.assertEqual(self.made.count("run.json"), 1)
+        # one for each training
+        self.assertEqual(len([*self.out.glob("events.out*")]), 2)
+        self.assertEqual((self.out / "policy.onnx").read_text(), "0")
+        self.assertEqual(self.output.count("continuing after iteration 2"), 1)
+
+    def test_a_request_to_one_process_stops_both_after_the_same_iteration(self):
+        self.assertEqual([end["stopped_by"] for end in self.second], [None, signal.SIGTERM])
         self.assertEqual(
             [c.name for c in checkpoints(self.out)], ["000001.pt", "000002.pt", "000003.pt"]
         )
-        self.assertEqual(len([name for name in self.made if name.startswith("events.out")]), 1)
-        self.assertTrue((self.out / "policy.onnx").is_file())
-        self.assertEqual(self.output.count("continuing after iteration 2"), 1)
 
 
 SCRIPTS = ROOT / "examples" / "cluster"
@@ -115,17 +117,32 @@ TOOLS = {
     """,
 }
 """What a cluster has, on one machine."""
+STAND_IN = """
+    import os, signal, sys, time
+    from pathlib import Path
+
+    def stop(*_):
+        file.write_text(file.read_text() + " stopped")
+        sys.exit(143)
+
+    train, option, out, *others = sys.argv[1:]
+    assert (train, option) == ("train", "--out")
+    file = Path(out + "-" + os.environ["RANK"])
+    signal.signal(signal.SIGTERM, stop)
+    file.write_text(os.environ["WORLD_SIZE"] + " " + "|".join(others))
+    time.sleep(60)
+"""
+"""In place of the package: a training that notes its arguments and that it was asked to stop."""
 
 
-class ScriptsTest(WithBank):
+class ScriptsTest(InFolder):
     """The job scripts, with stand-ins of Slurm's commands."""
 
     def setUp(self):
         super().setUp()
         self.requeued = self.folder / "requeued"
-        self.requeued.unlink(missing_ok=True)
         tools = self.folder / "bin"
-        tools.mkdir(exist_ok=True)
+        tools.mkdir()
         for name, text in TOOLS.items():
             (tools / name).write_text(dedent(text))
             (tools / name).chmod(0o755)
@@ -137,25 +154,27 @@ class ScriptsTest(WithBank):
 
     def start(self, script, *arguments):
         return subprocess.Popen(
-            ["bash", SCRIPTS / script, *map(str, arguments)], cwd=ROOT, env=self.environment,
+            ["bash", SCRIPTS / script, *map(str, arguments)], cwd=self.folder, env=self.environment,
             stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
         )  # fmt: skip
 
-    def test_two_nodes_train_together_and_stop_in_time(self):
+    def test_two_nodes_find_each_other_and_stop_in_time(self):
+        package = self.folder / "stand-in" / "xreset"
+        package.mkdir(parents=True)
+        (package / "__init__.py").touch()
+        (package / "__main__.py").write_text(dedent(STAND_IN))
+        self.environment["PYTHONPATH"] = str(package.parent)
         out = self.folder / "nodes"
-        options = f"--resets {self.bank} --engine mujoco --device cpu --num-envs 4 --iterations 40 {SMALL}"
-        job = self.start("train_many.slurm", out, *options.split())
-        while len(checkpoints(out)) < 2 and job.poll() is None:
+        job = self.start("train_many.slurm", out, "--resets", "a b.npz")
+        told = [out.with_name(f"nodes-{rank}") for rank in (0, 1)]
+        while not all(file.exists() for file in told) and job.poll() is None:
             time.sleep(0.05)
         job.send_signal(signal.SIGTERM)
         said = job.communicate()[0]
         self.assertNotEqual(job.returncode, 0, said)
         self.assertEqual(self.requeued.read_text(), f"requeue {os.getpid()}\n", said)
-        done = int(checkpoints(out)[-1].stem)
-        self.assertLess(done, 40)
-        content = read_checkpoint(checkpoints(out)[-1])
-        # iterations x processes x horizon x worlds
-        self.assertEqual(content.env_steps, done * 2 * 8 * 4)
+        for file in told:
+            self.assertEqual(file.read_text(), "2 --resets|a b.npz stopped")
 
     def test_a_training_that_was_stopped_is_queued_again_and_a_failed_one_is_not(self):
         (self.tools / "srun").write_text('#!/bin/bash\necho "$*"\nexit "$CODE"\n')

@@ -15,6 +15,9 @@ from xreset.geometry.dynamics import drive_inertia
 from xreset.physics.plugins import backend_status, make_backend
 
 BACKENDS = ("mujoco", "mujoco-warp", "pybullet", "sapien")
+ROBOT_DEPENDENT = [check.name for check in CHECKS if check.group == "state"]
+ROBOT_DEPENDENT += ["mass_properties", "joint_limits", "gravity_compensation"]
+"""Checks of what an engine reads from a robot's description. How its drives pull does not depend on the robot."""
 
 
 def make_local(name):
@@ -64,12 +67,9 @@ class EveryBackend(unittest.TestCase):
 
     @PYBULLET  # whose data package has the robot
     def test_a_robot_of_another_package(self):
-        robot_dependent = [
-            c.name for c in CHECKS if c.group in ("state", "robot") and not c.own_robot_only
-        ]
         for backend in BACKENDS:
             with self.subTest(backend=backend):
-                self.passes(backend, robot=panda(), only=robot_dependent)
+                self.passes(backend, robot=panda(), only=ROBOT_DEPENDENT)
         own = [check.name for check in CHECKS if check.own_robot_only]
         results = run(make_local("mujoco"), robot=panda(), only=own)
         self.assertEqual({result.verdict for result in results}, {"skipped"})

@@ -9,10 +9,9 @@ import shutil
 import signal
 import subprocess
 import sys
-import textwrap
 import threading
 import time
-from contextlib import redirect_stderr, suppress
+from contextlib import contextmanager, redirect_stderr, suppress
 from dataclasses import asdict, replace
 from pathlib import Path
 from unittest import SkipTest
@@ -45,6 +44,7 @@ from xreset.files.storage import claim, file_hash, write_json
 from xreset.learning import verbs
 from xreset.learning.checkpoint import load_moments, read_checkpoint
 from xreset.learning.config import ModelConfig, PpoConfig, ScheduleConfig, TrainConfig
+from xreset.learning.export import exported
 from xreset.learning.exported import read_policy
 from xreset.learning.recipes import RECIPES, own_terms_flags, starting_config
 from xreset.learning.run import (
@@ -70,6 +70,40 @@ def newest(out):
 
 def not_a_number(x):
     return x.tip_distance[:, 0] * float("nan")
+
+
+@contextmanager
+def exported_once():
+    """Export each checkpoint only once, because an export takes seconds."""
+    made = {}
+
+    def export(actor, contract, *, checkpoint):
+        key = file_hash(checkpoint)
+        if key not in made:
+            made[key] = exported(actor, contract, checkpoint=checkpoint)
+        return made[key]
+
+    with patch("xreset.learning.export.exported", export):
+        yield
+
+
+def work_in_a_terminal(file):
+    """Print to the terminal until a request to stop comes, or for two seconds; write how many came, and end the process."""
+    try:
+        sys.stdout = open(1, "w", closefd=False)  # noqa: SIM115  not the one that tests write to
+        with _stop_on_interrupt(say=True) as requests:
+            print("a line of progress", flush=True)
+            file.write_text("ready")
+            for _ in range(100):
+                time.sleep(0.02)
+                if requests:
+                    break
+            if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:
+                print("a line of progress", flush=True)
+        file.write_text(str(len(requests)))
+        os._exit(0)
+    finally:
+        os._exit(1)
 
 
 class TrainingTest(WithBank):
@@ -310,29 +344,15 @@ class TrainingTest(WithBank):
 
     def test_a_training_outlives_its_terminal(self):
         """The terminal closes: SIGHUP comes, and writing fails. With nohup it does not come."""
-        program = """
-            import signal, sys, time
-            from pathlib import Path
-            from xreset.learning.runner import _stop_on_interrupt
-            if sys.argv[2] == "nohup":
-                signal.signal(signal.SIGHUP, signal.SIG_IGN)
-            with _stop_on_interrupt(say=True) as requests:
-                print("a line of progress", flush=True)
-                Path(sys.argv[1]).write_text("ready")
-                for _ in range(100):
-                    time.sleep(0.02)
-                    if requests:
-                        break
-                if sys.argv[2] != "nohup":
-                    print("a line of progress", flush=True)
-            Path(sys.argv[1]).write_text(str(len(requests)))
-        """
-        for name, requests in (("closed", "1"), ("nohup", "0")):
+        for name, handler, requests in (
+            ("closed", signal.SIG_DFL, "1"),
+            ("nohup", signal.SIG_IGN, "0"),
+        ):
             file = self.folder / name
-            words = [sys.executable, "-c", textwrap.dedent(program), str(file), name]
             process, terminal = pty.fork()
             if process == 0:
-                os.execv(sys.executable, words)
+                signal.signal(signal.SIGHUP, handler)
+                work_in_a_terminal(file)
             while not file.exists() or file.read_text() != "ready":
                 time.sleep(0.05)
             os.close(terminal)
@@ -604,6 +624,7 @@ class TrainingTest(WithBank):
         policy = out / "policy.onnx"
         contract = OnnxPolicy(policy).contract
         policy.unlink()
+        self.enterContext(exported_once())
         newest_policy = read_policy(out).content
         self.assertEqual(read_policy(out).contract, contract)
         self.assertFalse(policy.exists(), "loading writes nothing")

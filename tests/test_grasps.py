@@ -22,14 +22,18 @@ def block(*size):
     return box_object(((0, 0, 0), size))
 
 
+@patch("xreset.resets.grasps._MOST", 60)
 class GraspsTest(TestCase):
     @classmethod
+    @patch("xreset.resets.grasps._MOST", 60)
     def setUpClass(cls):
         cls.robot = robots.load("ur7e-robotiq")
         cls.hand = HandModel(cls.robot)
+        cls.block = block(0.05, 0.12, 0.13)
+        cls.grasps = planned_grasps(cls.hand, cls.block)
 
     def test_pads_meet_the_two_sides_that_are_near_enough(self):
-        grasps = planned_grasps(self.hand, block(0.05, 0.12, 0.13))
+        grasps = self.grasps
         self.assertGreater(len(grasps.joints), 50)
         tips = self.hand.kinematics.points(
             grasps.joints, ["thumb_tip", "index_tip"], base=grasps.root
@@ -42,9 +46,8 @@ class GraspsTest(TestCase):
         self.assertTrue(((width > 0.05) & (width < 0.058)).all())
 
     def test_the_hand_is_clear_of_the_object_open_and_closed(self):
-        obj = block(0.05, 0.12, 0.13)
-        grasps = planned_grasps(self.hand, obj)
-        surface = prepared_surface(obj)
+        grasps = self.grasps
+        surface = prepared_surface(self.block)
         for joints in (grasps.joints, grasps.opened):
             poses = grasps.root[:, None] @ self.hand.kinematics.link_poses(
                 joints, self.hand.balls.links
@@ -77,7 +80,6 @@ class GraspsTest(TestCase):
         )
         return losses(bank, self.robot, (obj,), progress=lambda *_: None).tolist()
 
-    @patch("xreset.resets.grasps._MOST", 60)
     def test_reasons(self):
         post = block(0.05, 0.06, 0.14)
         lift = ABOVE + np.array([0, 0, 0.07])

@@ -1,6 +1,6 @@
 """Runs the unittest suite, one process per core, and ends with one line: ``N passed, N failed, N skipped``.
 
-usage: run_tests.py [--quick] [NAME ...]      (default: every tests/test_*.py; --quick: the modules in QUICK)
+usage: run_tests.py [--quick] [NAME ...]      (default: every tests/test_*.py; --quick: those in QUICK)
 """
 
 from __future__ import annotations
@@ -21,9 +21,11 @@ sys.path.insert(0, os.getcwd())
 
 
 QUICK = (
-    "task", "eval", "docs", "robots", "files", "render", "kinematics", "schedule", "accounts", "engines_page",
+    "task", "robots", "files", "render", "eval.MetricsTest", "eval.BootstrapTest", "kinematics",
+    "docs.PageTest", "docs.DocumentedTest.test_every_command_and_option_exists", "schedule", "accounts",
+    "engines_page",
 )  # fmt: skip
-"""Test modules of `--quick`: without physics, done in seconds."""
+"""Tests of `--quick`, which need neither physics nor all of the package: modules, classes or methods."""
 
 SLOW = (
     "conformance_engines", "training", "import_robot", "play_browser", "learns", "parity", "distributed",

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import chain, pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from xreset.eval.conditions import Property, property_of
-from xreset.eval.plots import COLORS
-from xreset.eval.results import EvalResult, Table, ci95, mean
-from xreset.eval.stats import Interval, bootstrap_ci95
+from xreset.eval.plots import COLORS, svg
+from xreset.eval.results import EvalResult
+from xreset.eval.stats import Interval, Table, bootstrap_ci95, ci95, mean
 from xreset.files.checks import frozen
 
 if TYPE_CHECKING:
@@ -195,16 +195,18 @@ def _deciding_points(result: EvalResult) -> Iterator[tuple[Curve, Effect, float]
 _COLUMNS = 4
 
 
-def plot_size(count: int) -> tuple[float, float]:
-    """Return the size of the drawing of a number of properties [inches]."""
-    width = max(2.9 * min(_COLUMNS, count), 5.0)
-    height = 0.8 + 2.3 * math.ceil(count / _COLUMNS)
-    return width, height
-
-
-def draw_curves(figure: Figure, results: Sequence[EvalResult]) -> None:
-    """Draw task progress against each property that was changed, a line for each engine."""
+def picture(results: Sequence[EvalResult], salt: str) -> str:
+    """Return the drawing of task progress against each property that was changed, a line for each engine, as SVG;
+    ``salt`` as of :func:`~xreset.eval.plots.svg`."""
     found = by_property(results)
+    width = max(2.9 * min(_COLUMNS, len(found)), 5.0)  # [inches]
+    height = 0.8 + 2.3 * math.ceil(len(found) / _COLUMNS)
+    return svg(lambda figure: _draw_all(figure, results, found), (width, height), f"sweep {salt}")
+
+
+def _draw_all(
+    figure: Figure, results: Sequence[EvalResult], found: Mapping[str, Sequence[Curve | None]]
+) -> None:
     columns = min(_COLUMNS, len(found))
     axes = figure.subplots(math.ceil(len(found) / columns), columns, squeeze=False, sharey=True)
     for ax in axes.flat[len(found) :]:

@@ -9,8 +9,8 @@ import numpy as np
 from xreset.env.manipulation import ManipulationEnv
 from xreset.errors import XResetError
 from xreset.eval.policy_spec import PolicySpec, load_policy
-from xreset.eval.report.clips import encode_mp4
 from xreset.files.storage import check_suffix, write_whole
+from xreset.pictures.render import encode_mp4
 
 
 def film(

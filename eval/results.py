@@ -12,7 +12,7 @@ from dataclasses import MISSING, asdict, field, fields, make_dataclass
 from functools import cache, cached_property
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, get_type_hints
+from typing import Annotated, Any, ClassVar, get_type_hints
 
 import numpy as np
 import pandas as pd
@@ -20,12 +20,7 @@ import pandas as pd
 from xreset.cameras.config import VisionConfig
 from xreset.errors import FileFormatError, RunError
 from xreset.eval.metrics import METRICS, Episode
-from xreset.eval.stats import (
-    Interval,
-    crossed_bootstrap_ci95,
-    difference_ci95,
-    share_ci95,
-)
+from xreset.eval.stats import Interval, Table, ci95, difference, mean
 from xreset.eval.table import table_text
 from xreset.files.checks import (
     Checked,
@@ -72,11 +67,6 @@ _LARGEST_STATE = 1e6
 
 _MAY_LACK = {"value", *(f.name for f in fields(Episode) if f.default is None)}
 """Columns in which a file may have null."""
-
-if TYPE_CHECKING:
-    Table = Any  # pandas' own types do not tell the rows of a table from one of its columns
-else:
-    Table = pd.DataFrame
 
 
 @frozen
@@ -295,33 +285,6 @@ def _with_nan(table: Table) -> Table:
     """Return a table with NaN in place of None."""
     unknown = {name: float for name in table if table[name].isna().any()}
     return table.astype(unknown | {"value": float})
-
-
-def mean(episodes: Table, metric: str) -> float:
-    """Return the mean of one metric over episodes, rounded to six digits; NaN if it was not measured in all of them."""
-    return round(float(episodes[metric].to_numpy(float).mean()), 6)
-
-
-def ci95(episodes: Table, metric: str) -> Interval:
-    """Return the 95 % interval of the mean over demonstrations; and over trainings, if the table is of several
-    (:func:`xreset.eval.stats.share_ci95`)."""
-    interval = share_ci95 if METRICS[metric].unit == "%" else crossed_bootstrap_ci95
-    return interval(*crossed(episodes, metric))
-
-
-def difference(one: Table, other: Table, metric: str) -> tuple[float, float, float]:
-    """Return the mean of a metric in ``other`` minus that in ``one``, and the lower and upper end of its 95 % interval
-    (:func:`xreset.eval.stats.difference_ci95`). Both have episodes on the same demonstrations."""
-    interval = difference_ci95(crossed(one, metric), crossed(other, metric))
-    return mean(other, metric) - mean(one, metric), *interval
-
-
-def crossed(episodes: Table, metric: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the metric, the index of the training and the demonstration of each episode, [E] each."""
-    runs = np.zeros(len(episodes), int)
-    if "run" in episodes:
-        runs = pd.factorize(episodes["run"])[0]
-    return episodes[metric].to_numpy(float), runs, episodes["sequence"].to_numpy()
 
 
 # Files ----------------------------------------------------------------------------------------------------------------

@@ -1,10 +1,19 @@
-"""Confidence intervals of evaluation results."""
+"""Means of the metrics of episodes, their differences, and confidence intervals."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pandas as pd
+
+from xreset.eval.metrics import METRICS
+
+if TYPE_CHECKING:
+    Table = Any  # pandas' own types do not tell the rows of a table from one of its columns
+else:
+    Table = pd.DataFrame
 
 Interval = tuple[float, float]
 """Lower and upper end of a 95 % interval."""
@@ -12,6 +21,33 @@ DRAWS = 2000
 """Resamples of a bootstrap."""
 _Z = 1.959963984540054
 """Half width of a 95 % interval of the normal distribution, in standard deviations."""
+
+
+def mean(episodes: Table, metric: str) -> float:
+    """Return the mean of one metric over episodes, rounded to six digits; NaN if it was not measured in all of them."""
+    return round(float(episodes[metric].to_numpy(float).mean()), 6)
+
+
+def ci95(episodes: Table, metric: str) -> Interval:
+    """Return the 95 % interval of the mean over demonstrations; and over trainings, if the table is of several
+    (:func:`share_ci95`)."""
+    interval = share_ci95 if METRICS[metric].unit == "%" else crossed_bootstrap_ci95
+    return interval(*crossed(episodes, metric))
+
+
+def difference(one: Table, other: Table, metric: str) -> tuple[float, float, float]:
+    """Return the mean of a metric in ``other`` minus that in ``one``, and the lower and upper end of its 95 % interval
+    (:func:`difference_ci95`). Both have episodes on the same demonstrations."""
+    interval = difference_ci95(crossed(one, metric), crossed(other, metric))
+    return mean(other, metric) - mean(one, metric), *interval
+
+
+def crossed(episodes: Table, metric: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the metric, the index of the training and the demonstration of each episode, [E] each."""
+    runs = np.zeros(len(episodes), int)
+    if "run" in episodes:
+        runs = pd.factorize(episodes["run"])[0]
+    return episodes[metric].to_numpy(float), runs, episodes["sequence"].to_numpy()
 
 
 def share_ci95(values: np.ndarray, runs: np.ndarray, groups: np.ndarray) -> Interval:

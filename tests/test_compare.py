@@ -20,8 +20,7 @@ from xreset import TrainConfig
 from xreset.errors import FileFormatError, RunError, XResetError
 from xreset.eval.metrics import METRICS
 from xreset.eval.plots import COLORS, figure_style
-from xreset.eval.report.curves import amounts, line
-from xreset.eval.report.figures import draw_lines
+from xreset.eval.report.curves import amounts, draw_lines, line
 from xreset.eval.report.groups import grouped, scores
 from xreset.eval.report.make import collect, page
 from xreset.eval.report.read import read_curves, read_training, read_trainings

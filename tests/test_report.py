@@ -30,11 +30,10 @@ from xreset.eval.report.clips import (
     best_everywhere,
     camera_for,
     draw_clips,
-    encode_mp4,
     make_film,
     worst_episodes,
 )
-from xreset.eval.report.figures import draw_training
+from xreset.eval.report.curves import draw_training
 from xreset.eval.report.groups import singles
 from xreset.eval.report.make import collect, count_failures, headline, page
 from xreset.eval.report.read import read_trainings
@@ -44,6 +43,7 @@ from xreset.eval.verbs import make_report
 from xreset.files.storage import claim_folder
 from xreset.geometry.shapes import pose_matrix
 from xreset.learning.clock import Lift, Passing, write_lift
+from xreset.pictures.render import encode_mp4
 
 VOID = {"meta", "br", "link", "img", "input", "hr"}
 
@@ -331,6 +331,7 @@ class ClipTest(Reported):
         rollouts = toy_rollouts(robot.home)
         self.write(rollouts=rollouts, joints=robot.joint_names, vision=vision)
         with (
+            mock.patch("xreset.eval.report.read.load_robot", lambda _: robot),
             mock.patch("xreset.eval.report.clips.load_robot", lambda _: robot),
             mock.patch("xreset.eval.report.clips.encode_mp4") as encode,
         ):

@@ -22,8 +22,9 @@ from xreset.eval.engines.measure import measure
 from xreset.eval.experiment import can_set, play
 from xreset.eval.metrics import METRICS
 from xreset.eval.policy_spec import PolicySpec
-from xreset.eval.results import EvalResult, Table, mean, write_result
+from xreset.eval.results import EvalResult, write_result
 from xreset.eval.rollout import Engine, Trial, nominal_scene
+from xreset.eval.stats import Table, mean
 from xreset.files.checks import frozen
 from xreset.files.progress import NamedProgress, unseen
 from xreset.files.storage import claim_folder

@@ -19,12 +19,12 @@ import pandas as pd
 from xreset.cameras.config import CAMERAS, VisionConfig, check_each_once
 from xreset.errors import XResetError, needs
 from xreset.eval.export.recorded import SCHEMA, RecordedEpisodes
-from xreset.eval.report.clips import draw_state, draw_view, encode_mp4, policy_cameras
+from xreset.eval.report.clips import draw_state, draw_view, policy_cameras
 from xreset.eval.results import Trace
 from xreset.files.progress import unseen
 from xreset.files.storage import atomic_folder, is_occupied, write_json
 from xreset.objects.catalogue import load_object
-from xreset.pictures.render import Renderer, Size
+from xreset.pictures.render import Renderer, Size, encode_mp4
 from xreset.spec import RobotSpec, SceneSpec
 
 _FORMAT = tomllib.loads(Path(__file__).with_suffix(".toml").read_text())
@@ -285,10 +285,9 @@ def _painter(
     """Return what draws the episodes of an object for one of the films, always from the same camera, so that episodes
     can be compared."""
     obj = load_object(object_name, meshes)
+    scene = SceneSpec(robot=robot, objects=(obj,))
     if video == VIDEO:
-        return partial(draw_state, Renderer(SceneSpec(robot=robot, objects=(obj,)), size=size))
+        return partial(draw_state, Renderer(scene, size=size))
     camera = CAMERAS[video.removeprefix(_DEPTH)]
     vision = VisionConfig(cameras=(camera,), width=size[0], height=size[1])
-    eyes = policy_cameras(robot, obj, vision)
-    assert eyes is not None, "there is a camera"
-    return partial(draw_view, eyes, width=size[0])
+    return partial(draw_view, policy_cameras(scene, vision), width=size[0])

@@ -14,7 +14,8 @@ import pandas as pd
 
 from xreset.errors import RunError
 from xreset.eval.report.read import results_in
-from xreset.eval.results import Table, Trace, read_evaluation, read_traces, recorded
+from xreset.eval.results import Trace, read_evaluation, read_traces, recorded
+from xreset.eval.stats import Table
 from xreset.files.checks import frozen
 from xreset.files.records import write_npz
 from xreset.files.storage import file_hash

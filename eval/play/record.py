@@ -11,7 +11,7 @@ import numpy as np
 from xreset.errors import XResetError
 from xreset.eval.play.session import Moment, Session
 from xreset.files.storage import write_whole
-from xreset.pictures.render import Renderer
+from xreset.pictures.render import Renderer, encode_mp4
 from xreset.spec import SceneSpec
 
 FRAMES_PER_SECOND = 20.0
@@ -73,8 +73,6 @@ def write_film(path: str | Path, session: Session, *, seconds: float = 10.0) -> 
 
 def draw_film(scene: SceneSpec, moments: Sequence[Moment]) -> bytes:
     """Draw moments as an mp4, :data:`FRAMES_PER_SECOND` of them for each second."""
-    from xreset.eval.report.clips import encode_mp4  # pandas, which playing does not need
-
     renderer = Renderer(scene, size=SIZE)
     every = max(1, round(1.0 / (FRAMES_PER_SECOND * scene.control_dt)))
     frames = []

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Sequence
 from itertools import chain
 from pathlib import Path
@@ -12,9 +11,10 @@ import numpy as np
 import pandas as pd
 
 from xreset.cameras.config import VisionConfig
-from xreset.errors import RunError, XResetError, needs
+from xreset.errors import RunError, XResetError
 from xreset.eval.report.read import Training
-from xreset.eval.results import Table, Trace
+from xreset.eval.results import Trace
+from xreset.eval.stats import Table
 from xreset.files.checks import frozen
 from xreset.files.storage import write_whole
 from xreset.files.text import short_name
@@ -22,7 +22,7 @@ from xreset.geometry.description import load_robot
 from xreset.geometry.shapes import pose_matrix
 from xreset.objects.catalogue import load_object
 from xreset.physics import State
-from xreset.pictures.render import Camera, Renderer, add_caption
+from xreset.pictures.render import Camera, Renderer, add_caption, encode_mp4
 from xreset.spec import ObjectSpec, RobotSpec, SceneSpec
 
 if TYPE_CHECKING:
@@ -113,19 +113,11 @@ def camera_for(trace: Trace, obj: ObjectSpec, *, distance: float = 1.0) -> Camer
     return Camera(eye=tuple((center + away).tolist()), target=tuple(center.tolist()))
 
 
-def draw_state(
-    renderer: Renderer, trace: Trace, row: int, cameras: Cameras | None = None
-) -> np.ndarray:
-    """Return an image [H, W, 3] uint8 of one state of a trace, with the goal as a translucent object.
-
-    The images of the policy's cameras, if it has any, are below.
-    """
+def draw_state(renderer: Renderer, trace: Trace, row: int) -> np.ndarray:
+    """Return an image [H, W, 3] uint8 of one state of a trace, with the goal as a translucent object."""
     pose = (trace.object_pos[row], trace.object_quat[row])
     goal = (trace.goal_pos, trace.goal_quat)
-    picture = renderer.draw(trace.joint_pos[row], pose, goal_pose=goal)
-    if cameras is None:
-        return picture
-    return np.vstack((picture, draw_view(cameras, trace, row, picture.shape[1])))
+    return renderer.draw(trace.joint_pos[row], pose, goal_pose=goal)
 
 
 def draw_view(cameras: Cameras, trace: Trace, row: int, width: int) -> np.ndarray:
@@ -156,17 +148,13 @@ def draw_view(cameras: Cameras, trace: Trace, row: int, width: int) -> np.ndarra
     return cameras.picture(0, width)
 
 
-def policy_cameras(
-    robot: RobotSpec, obj: ObjectSpec, vision: VisionConfig | None
-) -> Cameras | None:
-    """Return the cameras of a policy, for one world; None if it has none."""
-    if vision is None or not vision.cameras:
-        return None
+def policy_cameras(scene: SceneSpec, vision: VisionConfig) -> Cameras:
+    """Return the cameras of a policy, for one world."""
     import torch
 
     from xreset.cameras.sensor import Cameras  # imports Warp, which other policies do not need
 
-    return Cameras(SceneSpec(robot=robot, objects=(obj,)), torch.zeros(1, dtype=torch.long), vision)
+    return Cameras(scene, torch.zeros(1, dtype=torch.long), vision)
 
 
 def draw_clips(
@@ -183,7 +171,7 @@ def draw_clips(
         episodes: rows of :func:`xreset.eval.results.recorded`.
         robot: the robot.
         meshes: folder of object meshes; None: the stand-ins.
-        vision: cameras of the policy, whose images are drawn below.
+        vision: cameras of the policy, whose images are drawn below; None: it has none.
         strips: draw :data:`MOMENTS` states of each episode instead of a film.
     """
     rows = list(episodes.itertuples())
@@ -204,9 +192,13 @@ def draw_clips(
         broken = np.flatnonzero(~trace.finite)
         last = broken[0] - 1 if len(broken) else len(trace.time)
         drawn = np.minimum(shown, last).tolist()
-        renderer = Renderer(SceneSpec(robot=robot, objects=(obj,)), size=size, camera=camera)
-        cameras = policy_cameras(robot, obj, vision)
-        pictures = {row: draw_state(renderer, trace, row, cameras) for row in set(drawn)}
+        scene = SceneSpec(robot=robot, objects=(obj,))
+        renderer = Renderer(scene, size=size, camera=camera)
+        pictures = {row: draw_state(renderer, trace, row) for row in set(drawn)}
+        if vision is not None:
+            cameras = policy_cameras(scene, vision)
+            for row, picture in pictures.items():
+                pictures[row] = np.vstack((picture, draw_view(cameras, trace, row, size[0])))
         clip = Clip(
             episode=episode,
             frames=np.stack([pictures[row] for row in drawn]),
@@ -255,7 +247,7 @@ def draw_report(
 
 def recorded_in(trainings: Sequence[Training], robot: str | None) -> Table:
     """Return the recorded episodes of runs (:meth:`~xreset.eval.report.read.Training.recorded`)."""
-    parts = [t.recorded(load_robot(robot or t.robot)) for t in trainings]
+    parts = [t.recorded(robot or t.robot) for t in trainings]
     return pd.concat(parts, ignore_index=True)
 
 
@@ -302,40 +294,3 @@ def make_film(
         films.append(np.concatenate(column, axis=1))
     write_whole(out, encode_mp4(np.concatenate(films, axis=2), every[-1].fps))
     return tuple(columns)
-
-
-def encode_mp4(frames: np.ndarray, fps: float, *, keyframes: int | None = None) -> bytes:
-    """Encode a film as H.264 in an mp4 file that every browser plays.
-
-    Args:
-        frames: [T, H, W, 3] uint8 with even H and W.
-        fps: frames per second.
-        keyframes: number of frames from one keyframe to the next; None: the encoder's choice.
-
-    Raises:
-        XResetError: the encoder is not installed or fails.
-    """
-    with needs("imageio-ffmpeg", "eval"):
-        import imageio_ffmpeg
-    settings = "-crf 24 -preset veryfast -movflags +faststart -threads 1 -bitexact"
-    if keyframes is not None:
-        settings += f" -g {keyframes}"
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "clip.mp4"
-        writer = imageio_ffmpeg.write_frames(  # it accepts more types than its annotations say
-            str(path),
-            frames.shape[2:0:-1],
-            fps=fps,  # pyright: ignore[reportArgumentType]
-            codec="libx264",
-            macro_block_size=2,
-            quality=None,  # pyright: ignore[reportArgumentType]
-            output_params=settings.split(),
-        )
-        try:
-            writer.send(None)
-            for frame in frames:
-                writer.send(np.ascontiguousarray(frame))
-            writer.close()
-            return path.read_bytes()
-        except (OSError, RuntimeError) as error:
-            raise XResetError(f"the film cannot be encoded: {error}") from error

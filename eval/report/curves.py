@@ -1,4 +1,4 @@
-"""Learning curves: the amount of training at each iteration, and the mean curves of several trainings.
+"""Learning curves: the amount of training at each iteration, the mean curves of several trainings, and their drawing.
 
 The seconds of an iteration are its logged ``speed/collect_seconds`` + ``speed/learn_seconds``, and its steps are these
 seconds times ``speed/env_steps_per_second``, over all processes. Pauses before a run is continued, iterations that were
@@ -8,15 +8,23 @@ next one with a log.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from math import ceil
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 
 from xreset.errors import RunError
+from xreset.eval.plots import COLORS, INK, svg
 from xreset.eval.report import X
+from xreset.eval.report.groups import Groups
 from xreset.eval.report.read import Training
-from xreset.eval.results import Table
+from xreset.eval.stats import Table
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 AXES: dict[X, tuple[str, int, str, float]] = {
     "minutes": ("minutes of training", 1, "minutes", 1.0),
@@ -25,6 +33,51 @@ AXES: dict[X, tuple[str, int, str, float]] = {
 }
 """Label of an axis, digits in tables, field of :class:`~xreset.learning.clock.Lift`, and factor to the axis's unit."""
 _SPEED = ["speed/collect_seconds", "speed/learn_seconds", "speed/env_steps_per_second"]
+DEFAULT_CURVES = ("task/success", "task/success_from_home", "task/grasped", "episode/return")
+"""Curves that a report draws if a training has them."""
+TITLES = {
+    "task/success": "at the goal",
+    "task/success_from_home": "at the goal, from home",
+    "task/grasped": "thumb and a finger press",
+    "task/grasped_from_home": "thumb and a finger press, from home",
+    "episode/return": "episode return",
+    "episode/length": "episode length [control steps]",
+}
+"""Title of a curve's panel; other curves have their TensorBoard name."""
+_STYLES = ("-", (0, (5, 2)), (0, (1, 1.5)), (0, (5, 2, 1, 2)))
+"""Line styles; the next one begins when the colors repeat: at the ninth training, the seventeenth, and so on."""
+_WIDTH = 10.6
+"""Width of the drawing [inches]."""
+_PANEL = 2.7
+"""Height of a row of panels [inches]."""
+_COLUMNS = 2
+"""Panels in a row."""
+
+
+def usual_axis(trainings: Sequence[Training]) -> X:
+    """Return minutes if every training logged its speed, else iterations."""
+    try:
+        for training in trainings:
+            if len(training.curves):
+                amounts(training, "minutes")
+    except RunError:
+        return "iterations"
+    return "minutes"
+
+
+def chosen_curves(trainings: Sequence[Training], wanted: Sequence[str]) -> tuple[str, ...]:
+    """Return the names of the curves to draw: the wanted ones, or else those of
+    :data:`DEFAULT_CURVES` that a training has, each once.
+
+    Raises:
+        RunError: no training has one of the wanted curves.
+    """
+    known = sorted(set().union(*(t.curves for t in trainings)))
+    if unknown := set(wanted) - set(known):
+        raise RunError(
+            f"Unknown curve {', '.join(sorted(unknown))}. Choose with --curve from: {', '.join(known) or 'none'}."
+        )
+    return tuple(dict.fromkeys(wanted)) or tuple(tag for tag in DEFAULT_CURVES if tag in known)
 
 
 def amounts(training: Training, x: X) -> Table:
@@ -72,3 +125,86 @@ def line(members: Sequence[Training], tag: str, x: X) -> Table | None:
         {"mean": values.mean(axis=0), "low": values.min(axis=0), "high": values.max(axis=0)},
         index=at,
     )
+
+
+# The drawing ---------------------------------------------------------------------------------------------------------
+
+
+def color(index: int) -> str:
+    """Return the color of an engine or a training."""
+    return COLORS[index % len(COLORS)]
+
+
+def draw_training(groups: Groups, tags: Sequence[str], x: X) -> str:
+    """Return the drawing of learning curves as SVG, a panel for each; empty if there are none.
+
+    Args:
+        groups: the groups, each with a color of its own.
+        tags: curves that at least one training has.
+        x: horizontal axis of the curves.
+    """
+    if not tags:
+        return ""
+    order = list(groups)
+    rows = ceil(len(tags) / _COLUMNS)
+
+    def draw(figure: Figure) -> None:
+        from matplotlib.lines import Line2D
+
+        panels = figure.subplots(rows, min(len(tags), _COLUMNS), squeeze=False).flat
+        for ax in panels[len(tags) :]:
+            ax.set_axis_off()
+        for ax, tag in zip(panels, tags, strict=False):
+            lines = {label: line(members, tag, x) for label, members in groups.items()}
+            known = {label: curve for label, curve in lines.items() if curve is not None}
+            draw_lines(ax, tag, known, x, order)
+        if len(order) > 1:
+            handles = []
+            for i, label in enumerate(order):
+                look = {"color": color(i), "linestyle": _style(i)}
+                # matplotlib leaves out labels that begin with an underscore
+                handles.append(Line2D([], [], linewidth=2.5, label=f" {label}", **look))
+            figure.legend(handles=handles, loc="outside upper center", ncols=3, frameon=False)
+
+    legend = 0.1 + 0.25 * ceil(len(order) / 3) if len(order) > 1 else 0.0
+    return svg(draw, (_WIDTH, _PANEL * rows + legend), "curves")
+
+
+def draw_lines(ax: Axes, tag: str, lines: Mapping[str, Table], x: X, order: Sequence[str]) -> None:
+    """Draw one line for each group, with a band from ``low`` to ``high`` where they differ. Curves of the task are
+    shares, and are drawn in percent.
+
+    Args:
+        ax: axes to draw in.
+        tag: name of the curve.
+        lines: label -> :func:`line`.
+        x: kind of the horizontal axis.
+        order: labels of all groups: the position decides the color.
+    """
+    percent = tag.startswith("task/")
+    for label, curve in lines.items():
+        index = order.index(label)
+        values = curve * (100 if percent else 1)
+        at = curve.index
+        if (curve["high"] > curve["low"]).any():
+            ax.fill_between(
+                at, values["low"], values["high"], color=color(index), linewidth=0, alpha=0.2
+            )
+        # Above the axis, because many curves stay at zero.
+        look: dict[str, Any] = {"marker": "o" if len(at) < 10 else "", "markersize": 4, "zorder": 3}
+        ax.plot(
+            at, values["mean"], color=color(index), linestyle=_style(index), linewidth=1.5, **look
+        )
+    ax.set_title(TITLES.get(tag, tag), fontsize="medium", loc="left")
+    ax.grid(axis="y", color=INK, alpha=0.12)
+    if percent:
+        ax.yaxis.set_major_formatter(lambda value, _: f"{value:g} %")
+    ax.set_xlabel(AXES[x][0])
+    ax.set_xlim(left=0)
+    if percent:
+        ax.set_ylim(bottom=0)
+
+
+def _style(index: int) -> Any:
+    """Return the line style of a training."""
+    return _STYLES[index // len(COLORS) % len(_STYLES)]

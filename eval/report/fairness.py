@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pandas as pd
 
 from xreset.eval.metrics import GOAL_DISTANCE
-from xreset.eval.results import Table
+from xreset.eval.report.read import Training, by_engine, how_to_evaluate
+from xreset.eval.results import read_evaluation
+from xreset.eval.stats import Table
 from xreset.files.text import short_name
-
-if TYPE_CHECKING:
-    from xreset.eval.report.read import Training
+from xreset.learning.run import TEACHER
 
 _CONDITIONS = ("objects", "robot", "object meshes", "number of episodes", "seed of the evaluation")
 _PLAYED_TASK = ("task.termination.", "task.reset.spawn_", "task.timestep")
@@ -27,6 +27,46 @@ _IK = (
     "ik is a baseline without a policy: it plays the robot motion that was retargeted from the demonstration, without "
     "looking where the object is."
 )
+
+
+def doubts(trainings: Sequence[Training], groups: Mapping[str, Sequence[Training]]) -> list[str]:
+    """Return what makes a comparison of groups of trainings unfair, and the faults of engines in several trainings."""
+    found = uneven(trainings)
+    if len(trainings) > 1:
+        for label, members in groups.items():
+            found += health(label, by_engine(members))
+    return found
+
+
+def remarks(trainings: Sequence[Training]) -> list[str]:
+    """Return what a reader must know of each of some trainings, however they are compared."""
+    found = begun(trainings)
+    for training in trainings:
+        found += training.notes
+        if not training.results:
+            found.append(f"{training.label} has no results. {how_to_evaluate(training.folder)}")
+            continue
+        found += _about_teacher(training)
+        if len(trainings) == 1:
+            found += expected(training)
+    return found
+
+
+def _about_teacher(training: Training) -> list[str]:
+    """Return what a student misses of its teacher's episodes, or how to make the teacher's results."""
+    folder = training.folder
+    taught = read_evaluation(folder / "teacher")
+    missed = ""
+    if taught:
+        missed = missed_by_student(training.episodes, taught.to_frame())
+    if missed:
+        return [missed]
+    if training.run is None or training.run.teacher is None:
+        return []
+    return [
+        "The teacher was not evaluated from the same starts. Make its results first: "
+        f"xreset eval {folder / TEACHER} --out {folder / 'teacher'} --demos DEMOS"
+    ]
 
 
 def expected(training: Training) -> list[str]:
@@ -159,7 +199,7 @@ def health(label: str, episodes: Iterable[tuple[Any, Table]]) -> list[str]:
 
     Args:
         label: name of the training.
-        episodes: :func:`xreset.eval.report.groups.by_engine`.
+        episodes: :func:`xreset.eval.report.read.by_engine`.
     """
     sentences = []
     for engine, own in episodes:

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from math import nan
 from os.path import commonprefix
-from typing import Any
 
 import pandas as pd
 
 from xreset.eval.metrics import METRICS
 from xreset.eval.report.fairness import uneven
-from xreset.eval.report.read import Training
-from xreset.eval.results import Table, ci95, crossed, difference, mean
-from xreset.eval.stats import difference_p, holm
+from xreset.eval.report.read import Training, by_engine
+from xreset.eval.stats import Table, ci95, crossed, difference, difference_p, holm, mean
 
 Groups = dict[str, Sequence[Training]]
 """Label -> one training, or several that differ only in their seed. A group is a line of the picture."""
@@ -96,12 +94,6 @@ def scores(groups: Groups) -> Table:
     return pd.DataFrame(rows, columns=COLUMNS)
 
 
-def by_engine(members: Iterable[Training]) -> Sequence[tuple[Any, Table]]:
-    """Return every engine in which trainings were evaluated, with the episodes of all of them there."""
-    evaluated = [member.episodes for member in members if member.results]
-    return list(pd.concat(evaluated).groupby("engine")) if evaluated else []
-
-
 COUNTED = "episodes / demonstrations / seeds"
 """Name of the numbers that :func:`counted` returns."""
 
@@ -116,7 +108,7 @@ def estimate(episodes: Table, metric: str) -> tuple[float, float, float]:
     the lower and upper end of its 95 % interval; NaN without episodes.
 
     The interval is a bootstrap over demonstrations, as in ``xreset eval``, and for several trainings over trainings,
-    too (:func:`xreset.eval.results.ci95`).
+    too (:func:`xreset.eval.stats.ci95`).
     """
     if episodes.empty:
         return nan, nan, nan

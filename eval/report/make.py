@@ -13,31 +13,29 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from xreset.errors import RunError, XResetError
+from xreset.errors import XResetError
 from xreset.eval import effects
 from xreset.eval.metrics import METRICS
 from xreset.eval.pages import percent, render
-from xreset.eval.plots import COLORS, svg
+from xreset.eval.plots import COLORS
 from xreset.eval.report import X, fairness, tables
-from xreset.eval.report.clips import Clip, draw_report, encode_mp4
-from xreset.eval.report.curves import AXES, amounts
-from xreset.eval.report.figures import DEFAULT_CURVES, draw_training
+from xreset.eval.report.clips import Clip, draw_report
+from xreset.eval.report.curves import AXES, chosen_curves, draw_training, usual_axis
 from xreset.eval.report.groups import (
     COUNTED,
     Groups,
-    by_engine,
     differences,
     grouped,
     scores,
     singles,
 )
-from xreset.eval.report.read import Training, how_to_evaluate
-from xreset.eval.results import Evaluation, Table
+from xreset.eval.report.read import Training
+from xreset.eval.stats import Table
 from xreset.eval.table import Rows, caption
 from xreset.files.checks import frozen
 from xreset.files.storage import write_whole
 from xreset.files.text import Brief
-from xreset.pictures.render import encode_png
+from xreset.pictures.render import encode_mp4, encode_png
 
 
 @frozen
@@ -103,21 +101,13 @@ def collect(
     groups, reasons = (singles(trainings), []) if apart else grouped(trainings)
     found = scores(groups)
     if notes is None:
-        notes = [*reasons, *fairness.uneven(trainings)]
-        for label, members in groups.items():
-            notes += fairness.health(label, by_engine(members)) if len(trainings) > 1 else []
-    notes = [*notes, *fairness.begun(trainings)]
-    for training in trainings:
-        notes += training.notes
-        if not training.results:
-            notes.append(f"{training.label} has no results. {how_to_evaluate(training.folder)}")
-        elif len(trainings) == 1:
-            notes += fairness.expected(training)
+        notes = [*reasons, *fairness.doubts(trainings, groups)]
+    notes = [*notes, *fairness.remarks(trainings)]
     if not title and len(trainings) == 1 and trainings[0].results:
         first = trainings[0].first
         title = f"{first.policy} on {first.robot}"
-    tags = choose_curves(trainings, curves)
-    x = x or _axis(trainings)
+    tags = chosen_curves(trainings, curves)
+    x = x or usual_axis(trainings)
     return Report(
         title=title or ", ".join(groups),
         trainings=tuple(trainings),
@@ -149,35 +139,10 @@ def write_report(
     return replace(report, page=out / "index.html")
 
 
-def _axis(trainings: Sequence[Training]) -> X:
-    try:
-        for training in trainings:
-            if len(training.curves):
-                amounts(training, "minutes")
-    except RunError:
-        return "iterations"
-    return "minutes"
-
-
 def _without_formula(cell: Any) -> Any:
     """Return a cell that a spreadsheet does not take for a formula: names come from files."""
     is_formula = isinstance(cell, str) and cell.startswith(("=", "+", "-", "@", "\t", "\r"))
     return f"'{cell}" if is_formula else cell
-
-
-def choose_curves(trainings: Sequence[Training], wanted: Sequence[str]) -> tuple[str, ...]:
-    """Return the names of the curves to draw: the wanted ones, or else those of
-    :data:`~xreset.eval.report.figures.DEFAULT_CURVES` that a training has, each once.
-
-    Raises:
-        RunError: no training has one of the wanted curves.
-    """
-    known = sorted(set().union(*(t.curves for t in trainings)))
-    if unknown := set(wanted) - set(known):
-        raise RunError(
-            f"Unknown curve {', '.join(sorted(unknown))}. Choose with --curve from: {', '.join(known) or 'none'}."
-        )
-    return tuple(dict.fromkeys(wanted)) or tuple(tag for tag in DEFAULT_CURVES if tag in known)
 
 
 # The page -------------------------------------------------------------------------------------------------------------
@@ -276,14 +241,8 @@ def _sweeps(trainings: Sequence[Training]) -> Iterator[dict[str, Any]]:
                 "properties": effects.by_property(sweep),
                 "verdict": sentence,
                 "reasons": reasons,
-                "picture": draw_sweep(sweep, f"{training.label} {i}"),
+                "picture": effects.picture(sweep, f"{training.label} {i}"),
             }
-
-
-def draw_sweep(results: Evaluation, salt: str) -> str:
-    """Return the picture of the effects of each property as SVG."""
-    size = effects.plot_size(len(effects.by_property(results)))
-    return svg(lambda figure: effects.draw_curves(figure, results), size, f"sweep {salt}")
 
 
 def _base64(content: bytes) -> str:

@@ -13,25 +13,24 @@ import pandas as pd
 
 from xreset.cameras.config import VisionConfig
 from xreset.errors import FileFormatError, RunError, WrongValueError, needs
-from xreset.eval.report import fairness
 from xreset.eval.results import (
     EARLIER_SCHEMA,
     SCHEMA,
     EvalResult,
     Evaluation,
-    Table,
     read_evaluation,
     read_result,
     read_traces,
     recorded,
 )
+from xreset.eval.stats import Table
 from xreset.files.checks import frozen, renamed
 from xreset.files.storage import read_json
 from xreset.files.text import Brief, short_name, shown
 from xreset.geometry.description import load_robot
 from xreset.learning.clock import Lift, read_lift
 from xreset.learning.run import SCHEMA as RUN_SCHEMA
-from xreset.learning.run import TEACHER, RunInfo, flat, read_run
+from xreset.learning.run import RunInfo, flat, read_run
 from xreset.policy.shipped import run_folder
 from xreset.spec import RobotSpec
 
@@ -102,6 +101,12 @@ class Training(Brief):
             for engine in self.results
         ]
         return pd.concat(parts, ignore_index=True)
+
+
+def by_engine(members: Iterable[Training]) -> Sequence[tuple[Any, Table]]:
+    """Return every engine in which trainings were evaluated, with the episodes of all of them there."""
+    evaluated = [member.episodes for member in members if member.results]
+    return list(pd.concat(evaluated).groupby("engine")) if evaluated else []
 
 
 def versions(trainings: Iterable[Training], engine: str) -> str:
@@ -223,7 +228,7 @@ def read_trainings(runs: Sequence[str | Path]) -> tuple[Training, ...]:
                 raise RunError(
                     f"{text!r} is not NAME=FOLDER: a {'folder' if label else 'name'} is missing."
                 )
-        folder = run_folder(name)
+        folder = Path(name)
         label = label or name_of(folder)
         if label in folders:
             raise RunError(
@@ -300,7 +305,6 @@ def _with_run(training: Training) -> Training:
         for place in {place.resolve(): place for place in places}.values():
             if sweep := _sweep(place, policies, notes):
                 sweeps.append(sweep)
-        notes += _about_teacher(training, run)
     return replace(training, facts=facts, run=run, sweeps=tuple(sweeps), notes=tuple(notes))
 
 
@@ -322,23 +326,6 @@ def _sweep(folder: Path, policies: set[str | None], notes: list[str]) -> Evaluat
         if len(result.changed) and result.inputs.get("policy") in policies:
             found.append(result)
     return found
-
-
-def _about_teacher(training: Training, run: RunInfo | None) -> list[str]:
-    """Return what a student misses of its teacher's episodes, or how to make the teacher's results."""
-    folder = training.folder
-    taught = read_evaluation(folder / "teacher")
-    missed = ""
-    if taught:
-        missed = fairness.missed_by_student(training.episodes, taught.to_frame())
-    if missed:
-        return [missed]
-    if run is None or run.teacher is None:
-        return []
-    return [
-        "The teacher was not evaluated from the same starts. Make its results first: "
-        f"xreset eval {folder / TEACHER} --out {folder / 'teacher'} --demos DEMOS"
-    ]
 
 
 def without_results(folder: Path) -> RunError:

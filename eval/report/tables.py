@@ -12,7 +12,7 @@ from xreset.eval.metrics import METRICS
 from xreset.eval.report.curves import AXES, X, amounts
 from xreset.eval.report.groups import EVERY, Groups, by_engine, certain_differences, counted
 from xreset.eval.report.read import Training, versions
-from xreset.eval.results import Table
+from xreset.eval.stats import Table
 from xreset.eval.table import Rows
 from xreset.files.checks import frozen
 from xreset.learning.clock import SHARES, Lift

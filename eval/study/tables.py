@@ -10,7 +10,8 @@ import pandas as pd
 from xreset.eval.metrics import METRICS
 from xreset.eval.report.groups import COUNTED, counted, estimate
 from xreset.eval.report.read import Training, read_training, versions
-from xreset.eval.results import Table, has_results
+from xreset.eval.results import has_results
+from xreset.eval.stats import Table
 from xreset.eval.study.file import TableSpec
 from xreset.eval.study.paper import ALL, PaperTable, paper_tables
 from xreset.eval.study.plan import Plan

@@ -85,14 +85,14 @@ def _write_png(path: Path, shown: data.View, rows: np.ndarray, frame: int | None
 
 
 def _write_mp4(path: Path, shown: data.View, rows: np.ndarray) -> None:
-    from xreset.eval.report import clips
+    from xreset.pictures import render
     from xreset.pictures.view import picture
 
     if not len(rows):
         raise XResetError("This sequence has no state to film. Choose another one with --sequence.")
     draw = picture.Drawer(shown).draw
     frames = [draw(int(row)) for row in track(rows, "drawing", console=console, transient=True)]
-    film = clips.encode_mp4(np.stack(frames), shown.rate)
+    film = render.encode_mp4(np.stack(frames), shown.rate)
     write_whole(path, film)
     print(f"{len(rows)} frames in {path}")
 

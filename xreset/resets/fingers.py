@@ -18,7 +18,7 @@ from xreset.geometry.dynamics import drive_values
 from xreset.geometry.fields import DistanceFields
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import matvec, quat_rotate, quat_rotate_inverse
-from xreset.geometry.surface import Surface
+from xreset.geometry.surface import prepared_surface
 from xreset.resets.config import SqueezeConfig
 from xreset.resets.programs import pressing_targets
 from xreset.spec import GRAVITY, ObjectSpec, RobotSpec
@@ -90,7 +90,7 @@ def fingers_of(
     kinematics = Kinematics(robot)
     poses = kinematics.link_poses(q, links)
     names = [obj.name for obj in objects]
-    fields = DistanceFields.join([Surface(obj).field for obj in objects])
+    fields = DistanceFields.join([prepared_surface(obj).field for obj in objects])
     which = torch.tensor([names.index(name) for name in object_name], dtype=torch.long)
     gap = q.new_zeros(len(q), len(links))
     point = q.new_zeros(len(q), len(links), 3)

@@ -55,7 +55,9 @@ _CANDIDATES = 40
 _SEED = 0
 """Seed of the grasps that are drawn."""
 _BATCH = 512
-"""Candidates whose inverse kinematics is solved at a time; limits the memory that this takes."""
+"""Candidates whose inverse kinematics is solved at a time, at most; limits the memory that this takes."""
+_SMALL_BATCH = 64
+"""So few candidates take less time in one batch than a second process takes to start."""
 
 
 @frozen
@@ -118,17 +120,68 @@ def add_transfers(
     pose, grasp = _candidates(bank, grasps, poses)
     used = objects_named(objects, bank.object_name[grasp])
     scene = SceneSpec(robot=robot, objects=tuple(used.values()))
-    count = len(pose)
-    work = count * (1 + len(bank.engines))
+    place = np.arange(len(pose)) - np.searchsorted(pose, pose)
+    rows = [np.zeros(0, dtype=int)]
+    states = []
+    at_once = 2 * config.per_pose
+    work = len(pose) * (1 + len(bank.engines))
+    for first in range(0, _CANDIDATES, at_once):
+        found = np.bincount(pose[np.concatenate(rows)], minlength=len(poses.sequence))
+        is_next = (place >= first) & (place < first + at_once)
+        tried = np.flatnonzero(is_next & (found[pose] < config.per_pose))
+        if not len(tried):
+            break
+        before = work * np.mean(place < first)
+        share = work * np.mean(is_next)
+        holding, held = _holding(
+            bank,
+            grasp[tried],
+            poses,
+            pose[tried],
+            (robot, scene),
+            num_envs=num_envs,
+            device=device,
+            progress=lambda part, before=before, share=share: progress(before + share * part, work),
+        )
+        rows.append(tried[held])
+        states.append(holding)
+    progress(work, work)
+    if not states:
+        return replace(bank, transferred=np.zeros(bank.num_states, dtype=bool))
+    order = np.argsort(np.concatenate(rows))
+    held = np.concatenate(rows)[order]
+    kept = _first_of_each(held, pose, config.per_pose)
+    chosen = order[np.searchsorted(held, kept)]
+    return _joined(bank, State.cat(states)[torch.as_tensor(chosen)], poses, pose[kept])
+
+
+def _holding(
+    bank: ResetBank,
+    grasp: np.ndarray,
+    poses: _Poses,
+    pose: np.ndarray,
+    robot_and_scene: tuple[RobotSpec, SceneSpec],
+    *,
+    num_envs: int,
+    device: str,
+    progress: Callable[[float], None],
+) -> tuple[State, np.ndarray]:
+    """Try grasps at poses; arguments as of :func:`add_transfers` and :func:`_carried`.
+
+    Returns:
+        The states in which the arm reaches the grasp and the hand holds the object in every engine, and their
+        candidates, ascending.
+    """
+    robot, scene = robot_and_scene
+    count = len(grasp)
+    steps = 1 + len(bank.engines)
     states, is_reached = _carried(
-        bank, grasp, poses, pose, robot, lambda done: progress(done, work)
+        bank, grasp, poses, pose, robot, lambda done: progress(done / count / steps)
     )
     held = np.flatnonzero(is_reached)
     for number, engine in enumerate(bank.engines, start=1):
         if not len(held):
             break
-        before = number * count
-        share = count / len(held)
         holds = probe(
             engine,
             scene,
@@ -139,12 +192,12 @@ def add_transfers(
             steps=_STEPS,
             num_envs=num_envs,
             device=device,
-            progress=lambda done, before=before, share=share: progress(before + share * done, work),
+            progress=lambda done, number=number, of=held.size: progress(
+                (number + done / of) / steps
+            ),
         )
         held = held[holds]
-    progress(work, work)
-    kept = _first_of_each(held, pose, config.per_pose)
-    return _joined(bank, states[torch.as_tensor(kept)], poses, pose[kept])
+    return states[torch.as_tensor(held)], held
 
 
 def _grasps(bank: ResetBank, retargeted: Retargeted, robot: RobotSpec) -> np.ndarray:
@@ -232,7 +285,9 @@ def _carried(
     root_turn = turn * Rotation.from_matrix(root[:, :3, :3])
     root_quat = matrix_to_quat(torch.as_tensor(root_turn.as_matrix()))
     hand_joints = torch.as_tensor(joint_pos[:, model.hand.joint_indices])
-    batches = [slice(first, first + _BATCH) for first in range(0, len(grasp), _BATCH)]
+    # an even number of batches, for two cores
+    number = 2 * -(-len(grasp) // (2 * _BATCH)) if len(grasp) > _SMALL_BATCH else 1
+    batches = np.array_split(np.arange(len(grasp)), number)
     paths = [
         ArmTargets.of_poses(
             torch.as_tensor(root_pos[rows]), root_quat[rows], hand_joints[rows, None]
@@ -242,9 +297,9 @@ def _carried(
     solved = track_each(robot, paths, _THRESHOLDS, QUICK)
     is_reached = np.zeros(len(grasp), dtype=bool)
     for rows, (arm, measures) in zip(batches, solved, strict=True):
-        joint_pos[rows, robot.arm_indices] = arm[:, 0].numpy()
+        joint_pos[rows[:, None], robot.arm_indices] = arm[:, 0].numpy()
         is_reached[rows] = (classify(measures, _THRESHOLDS) == 0)[:, 0].numpy()
-        progress(min(rows.stop, len(grasp)))
+        progress(int(rows[-1]) + 1)
     joint_target = joint_pos.copy()
     joint_target[:, robot.hand_indices] = bank.targets[grasp][:, robot.hand_indices]
     arrays = (joint_pos, poses.pos[pose], poses.quat[pose], joint_target)

@@ -10,7 +10,7 @@ Shape letters: Q balls, G links with balls, R guards, H pairs of links.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from itertools import pairwise, product
+from itertools import product
 
 import numpy as np
 import torch
@@ -52,24 +52,28 @@ class Balls(Tensors):
 
     links: tuple[str, ...]
     """Links that carry balls (length G)."""
-    slices: tuple[slice, ...]
-    """Balls of each link (length G)."""
+    first: Tensor
+    """[G] first ball of each link."""
+    count: Tensor
+    """[G] number of balls of each link."""
     link: Tensor
     """[Q] link of each ball, as an index of ``links``: ascending."""
     centers: Tensor
     """[Q, 3] in the link's frame."""
     radii: Tensor
     """[Q] [m]; 0 for edges and corners."""
-    bound_centers: Tensor
-    """[G, 3] center, in the link's frame, of a ball around all balls of the link."""
-    bound_radii: Tensor
-    """[G] [m]"""
+    middles: Tensor
+    """[G, 3] middle of a box around all balls of the link, in its frame."""
+    half_sizes: Tensor
+    """[G, 3] half the sides of this box [m]."""
     guards: Tensor
     """[R] balls that keep out of other links; two of one link are at least :data:`APART` apart."""
     guard_radii: Tensor
     """[R] their radii against other links [m]: larger where they represent other balls."""
-    guard_slices: tuple[slice, ...]
-    """Guards of each link (length G)."""
+    first_guard: Tensor
+    """[G] first guard of each link."""
+    guard_count: Tensor
+    """[G] number of guards of each link."""
     fields: DistanceFields
     """Signed distances to the G links, in their frames."""
     link_pairs: Tensor
@@ -93,38 +97,61 @@ def hand_balls(hand: Kinematics, collision: SelfCollision) -> Balls:
     balls = [link_balls(shapes) for shapes in solids.values()]
     centers = [own for own, _ in balls]
     radii = [own for _, own in balls]
-    slices = _slices(radii)
+    first, count = _ranges(radii)
     guards = []
     guard_radii = []
-    for own_centers, own_radii, own in zip(centers, radii, slices, strict=True):
+    lows = []
+    highs = []
+    for own_centers, own_radii, own in zip(centers, radii, first.tolist(), strict=True):
+        lows.append((own_centers - own_radii[:, None]).min(axis=0))
+        highs.append((own_centers + own_radii[:, None]).max(axis=0))
         chosen = _apart(own_centers, own_radii, APART)
         gaps = np.linalg.norm(own_centers[chosen][:, None] - own_centers, axis=-1)
         has_neighbor = (gaps <= APART).sum(axis=1) > 1
-        guards.append(chosen + own.start)
+        guards.append(chosen + own)
         guard_radii.append(own_radii[chosen] + STAND_IN * has_neighbor)
     pairs = [(links.index(a), links.index(b)) for a, b in collision.link_pairs]
     both_ways = np.array([*pairs, *(pair[::-1] for pair in pairs)], dtype=np.int64)
-    bound_centers, bound_radii = bounding_balls(centers, radii)
+    low = torch.as_tensor(np.array(lows).reshape(-1, 3))
+    high = torch.as_tensor(np.array(highs).reshape(-1, 3))
+    first_guard, guard_count = _ranges(guard_radii)
     return Balls(
         links=links,
-        slices=slices,
-        link=torch.as_tensor(np.repeat(np.arange(len(links)), [len(own) for own in radii])),
+        first=first,
+        count=count,
+        link=torch.arange(len(links)).repeat_interleave(count),
         centers=joined(centers, 3),
         radii=joined(radii),
-        bound_centers=bound_centers,
-        bound_radii=bound_radii,
+        middles=(low + high) / 2,
+        half_sizes=(high - low) / 2,
         guards=joined(guards).long(),
         guard_radii=joined(guard_radii),
-        guard_slices=_slices(guard_radii),
+        first_guard=first_guard,
+        guard_count=guard_count,
         fields=DistanceFields.join([link_field(shapes) for shapes in solids.values()]),
         link_pairs=torch.as_tensor(both_ways.reshape(-1, 2)),
     )
 
 
-def _slices(parts: Sequence[np.ndarray]) -> tuple[slice, ...]:
-    """Return where each part is among the rows of all parts."""
-    ends = np.cumsum([0, *(len(part) for part in parts)]).tolist()
-    return tuple(slice(first, end) for first, end in pairwise(ends))
+def _ranges(parts: Sequence[np.ndarray]) -> tuple[Tensor, Tensor]:
+    """Return where each part begins among the rows of all parts, and its number of rows."""
+    count = torch.tensor([len(part) for part in parts], dtype=torch.long)
+    return count.cumsum(0) - count, count
+
+
+def members(first: Tensor, count: Tensor) -> tuple[Tensor, Tensor]:
+    """List the elements of ranges.
+
+    Args:
+        first: [K] first element of each range.
+        count: [K] number of its elements.
+
+    Returns:
+        [N] range of each element, ascending, and [N] the element.
+    """
+    owner = torch.arange(len(count), device=count.device).repeat_interleave(count)
+    skipped = first - (count.cumsum(0) - count)
+    return owner, torch.arange(len(owner), device=count.device) + skipped[owner]
 
 
 def joined(parts: Sequence[np.ndarray], *shape: int) -> Tensor:

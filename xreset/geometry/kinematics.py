@@ -54,6 +54,35 @@ class _Step(NamedTuple):
     """[3] joint axis in the parent's frame."""
 
 
+class Twists(NamedTuple):
+    """Links of B configurations, and the velocities that the joints above give them."""
+
+    pos: Tensor
+    """[B, P, 3] position of each link's origin."""
+    rot: Tensor
+    """[B, P, 3, 3] rotation of each link."""
+    twists: Tensor
+    """[B, 6, m] velocity of the point at the root's origin, and angular velocity, of a body that a moving joint
+    carries, per velocity of that joint; along the axes of ``pos``."""
+    carried: Tensor
+    """[P, m] 1: the joint moves the link; 0: it does not."""
+    coupling: Tensor
+    """[m, J] speed of each moving joint, by the joints' speeds."""
+
+
+class _Movers(NamedTuple):
+    """The m moving joints that move any of some links."""
+
+    rows: list[int]
+    """Rows among the moving joints."""
+    carried: Tensor
+    """[links, m] 1: the joint moves the link; 0: it does not."""
+    turns: Tensor
+    """[m, 1] 1: a joint turns; 0: it slides."""
+    coupling: Tensor
+    """[m, J] speed of each moving joint, by the joints' speeds."""
+
+
 class _Chain(NamedTuple):
     """Some links and everything above them (n links, m moving joints), for few operations on large tensors."""
 
@@ -206,14 +235,18 @@ class Kinematics:
         self._moved = cache(self._moved_by_joints)
         self._chain = cache(self._chain_of)
 
-    def _moved_by_joints(self, links: tuple[int, ...]) -> list[tuple[int, Tensor]]:
-        """Return the moving joints that move any of the links, each with the positions of these links in ``links``."""
-        moved = []
-        for row, joint in enumerate(self._moving):
-            rows = self._above[links, self._link_index[joint.child]].nonzero()[0]
-            if len(rows):
-                moved.append((row, self._indices(rows)))
-        return moved
+    def _moved_by_joints(self, links: tuple[int, ...]) -> _Movers:
+        """Return the moving joints that move any of the links."""
+        children = [self._link_index[joint.child] for joint in self._moving]
+        carried = self._above[np.ix_(links, children)]
+        rows = carried.any(axis=0).nonzero()[0].tolist()
+        turns = [self._moving[row].type == "revolute" for row in rows]
+        return _Movers(
+            rows=rows,
+            carried=self.array(carried[:, rows]),
+            turns=self.array(turns)[:, None],
+            coupling=self._coupling[rows],
+        )
 
     def link_index(self, name: str) -> int:
         """Return the index of a link in :attr:`link_names`; ``RobotError`` if no link below the root has that name."""
@@ -294,23 +327,35 @@ class Kinematics:
         if offsets is not None:
             given: Any = self._library.broadcast_to(offsets, (*shape, 3)).reshape(pos.shape)
             pos = pos + (rot @ given[..., None])[..., 0]
-        moved = self._moved(tuple(indices))
-        linear = self._zeros(*pos.shape, len(moved))
-        angular = self._zeros(*pos.shape, len(moved))
-        for column, (joint, rows) in enumerate(moved):
-            axis = axes[joint][:, None]
-            motion = self._library.broadcast_to(axis, (len(axis), len(rows), 3))
-            if self._moving[joint].type == "revolute":
-                angular[..., column][:, rows] = motion
-                motion = self._cross(motion, pos[:, rows] - origins[joint][:, None])
-            linear[..., column][:, rows] = motion
-        coupling = self._coupling[[joint for joint, _ in moved]]
+        movers = self._moved(tuple(indices))
+        axis = axes[:, None]
+        carried = movers.carried[..., None]
+        lever = pos[:, :, None] - origins[:, None]  # [B, P, m, 3]
+        across = self._cross(self._library.broadcast_to(axis, lever.shape), lever)
+        linear = (movers.turns * across + (1.0 - movers.turns) * axis) * carried
+        angular = axis * (movers.turns * carried)
+        coupling = movers.coupling
+        columns = (*shape, 3, coupling.shape[1])
         return PointJacobian(
             pos=pos.reshape(*shape, 3),
             rot=rot.reshape(*shape, 3, 3),
-            linear=(linear @ coupling).reshape(*shape, 3, coupling.shape[1]),
-            angular=(angular @ coupling).reshape(*shape, 3, coupling.shape[1]),
+            linear=(linear.swapaxes(-1, -2) @ coupling).reshape(columns),
+            angular=(angular.swapaxes(-1, -2) @ coupling).reshape(columns),
         )
+
+    def twists(self, q: Tensor, links: Sequence[str], base: Tensor) -> Twists:
+        """Compute links and the twists of the joints above them, at joint positions [B, J] with the root at [B, 4, 4].
+
+        This needs less arithmetic than :meth:`jacobian`: a point p of a link, seen from the root's origin, moves by
+        v + w x p.
+        """
+        indices = [self.link_index(name) for name in links]
+        rot, pos, axes, origins = self._forward(q, base, indices)
+        movers = self._moved(tuple(indices))
+        across = self._cross(origins - base[:, None, :3, 3], axes)
+        linear = movers.turns * across + (1.0 - movers.turns) * axes
+        both = self._library.concatenate((linear, movers.turns * axes), -1)
+        return Twists(pos, rot, both.swapaxes(-1, -2), movers.carried, movers.coupling)
 
     def motion(
         self, q: Tensor, qd: Tensor, links: Sequence[str]
@@ -411,8 +456,8 @@ class Kinematics:
         """Compute the wanted links, and the joints above them.
 
         Returns:
-            Rotations [B, n, 3, 3] and positions [B, n, 3] of the links; axes and origins [B, 3] of the joints, by their
-            row among the moving joints.
+            Rotations [B, n, 3, 3] and positions [B, n, 3] of the links; axes and origins [B, m, 3] of the moving joints
+            above them.
         """
         if q.shape[-1] != len(self.joint_names):
             raise ValueError(
@@ -425,8 +470,8 @@ class Kinematics:
         root: Any = self._library.broadcast_to(root, (*q.shape[:-1], 4, 4)).reshape(-1, 4, 4)
         rotations = {0: root[:, :3, :3]}
         positions = {0: root[:, :3, 3]}
-        axes: dict[int, Tensor] = {}
-        origins: dict[int, Tensor] = {}
+        axes = [self._zeros(len(root), 0, 3)]
+        origins = [self._zeros(len(root), 0, 3)]
         needed = self._above[list(wanted)].any(axis=0)
         for i, step in enumerate(self._steps, start=1):
             if not needed[i]:
@@ -437,8 +482,8 @@ class Kinematics:
             joint = step.moving
             if joint >= 0:
                 axis = parent @ step.axis
-                axes[joint] = axis
-                origins[joint] = origin
+                axes.append(axis[:, None])
+                origins.append(origin[:, None])
                 if step.prismatic:
                     origin = origin + axis * values[:, joint, None]
                 else:
@@ -448,6 +493,7 @@ class Kinematics:
                     )
             rotations[i] = rotation
             positions[i] = origin
-        stack = self._library.stack
-        rot = stack([rotations[i] for i in wanted], axis=1)
-        return rot, stack([positions[i] for i in wanted], axis=1), axes, origins
+        rot = self._library.stack([rotations[i] for i in wanted], axis=1)
+        pos = self._library.stack([positions[i] for i in wanted], axis=1)
+        join = self._library.concatenate
+        return rot, pos, join(axes, axis=1), join(origins, axis=1)

@@ -256,7 +256,8 @@ def _is_outside(model: HandModel, surface: Surface, root: Tensor, joints: Tensor
     balls = model.balls
     outside = torch.ones(len(root), dtype=torch.bool)
     poses = root[:, None] @ model.kinematics.link_poses(joints, balls.links)
-    for link, own in enumerate(balls.slices):
+    for link, (first, count) in enumerate(zip(balls.first, balls.count, strict=True)):
+        own = slice(int(first), int(first + count))
         rows = outside.nonzero()[:, 0]
         centers = balls.centers[own] @ poses[rows, link, :3, :3].mT + poses[rows, link, None, :3, 3]
         radii = balls.radii[own].repeat(len(rows))

@@ -131,8 +131,8 @@ def add_transfers(
         tried = np.flatnonzero(is_next & (found[pose] < config.per_pose))
         if not len(tried):
             break
-        before = work * np.mean(place < first)
-        share = work * np.mean(is_next)
+        before = work * float(np.mean(place < first))
+        share = work * float(np.mean(is_next))
         holding, held = _holding(
             bank,
             grasp[tried],

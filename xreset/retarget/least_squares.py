@@ -51,6 +51,7 @@ def minimize(
     done: Callable[[Any, Any, Tensor, Tensor, Tensor], Tensor],
     iterations: int,
     *,
+    damping: float = 1e-3,
     damping_range: tuple[float, float] = (0.0, inf),
 ) -> Any:
     """Take damped Gauss-Newton steps. A problem keeps a step if it lowers the cost, and is left out when it is done.
@@ -63,6 +64,7 @@ def minimize(
         done: returns whether problems are done [R], given x before and after the step, both costs [R], and the damping
             [R] of the next step.
         iterations: largest number of steps.
+        damping: damping of the first step.
         damping_range: smallest and largest damping.
 
     Returns:
@@ -70,16 +72,16 @@ def minimize(
     """
     first = x if isinstance(x, Tensor) else next(iter(vars(x).values()))
     rows = torch.arange(len(first), device=first.device)
-    damping = torch.full((len(rows),), 1e-3, dtype=torch.float64, device=first.device)
+    dampings = torch.full((len(rows),), damping, dtype=torch.float64, device=first.device)
     best = x.clone()
     now = x
     here = evaluate(x, rows)
     for _ in range(iterations):
-        trial = step(now, here, damping)
+        trial = step(now, here, dampings)
         there = evaluate(trial, rows)
         better = there.cost < here.cost
-        damping = torch.where(better, damping * 0.2, damping * 8.0).clamp(*damping_range)
-        left = ~done(now, trial, here.cost, there.cost, damping)
+        dampings = torch.where(better, dampings * 0.2, dampings * 8.0).clamp(*damping_range)
+        left = ~done(now, trial, here.cost, there.cost, dampings)
         now = where(better, trial, now)
         here = where(better, there, here)
         best[rows] = now
@@ -87,7 +89,7 @@ def minimize(
             break
         if not left.all():
             rows = rows[left]
-            damping = damping[left]
+            dampings = dampings[left]
             now = now[left]
             here = here[left]
     return best

@@ -33,8 +33,10 @@ from xreset.retarget.hand.solve import retarget_hand
 from xreset.retarget.validity import REASONS, Thresholds, classify, too_deep
 from xreset.spec import ObjectSpec, RobotSpec, objects_named
 
-_SEQUENCES_PER_BATCH = 24
-"""Enough to use the processor well; few enough to keep memory below about 1 GB and to show progress."""
+_SEQUENCES_PER_BATCH = 45
+"""At most: enough to use the processor well; few enough to keep memory below about 1 GB and to show progress."""
+_SMALL_BATCH = 10
+"""So few sequences take less time in one batch than a second process takes to start."""
 _FRAMES_AT_ONCE = 512
 """Frames whose measures are taken at a time; limits the memory that this takes."""
 _THRESHOLDS = Thresholds()
@@ -184,8 +186,11 @@ class HandMotions:
         robot = self.model.robot
         parts = []
         jobs = []
-        for begin in range(0, len(todo), _SEQUENCES_PER_BATCH):
-            sequences = todo[begin : begin + _SEQUENCES_PER_BATCH]
+        count = 1
+        if len(todo) > _SMALL_BATCH:
+            # an even number, for two cores
+            count = 2 * -(-len(todo) // (2 * _SEQUENCES_PER_BATCH))
+        for sequences in np.array_split(todo, count):
             rows = np.flatnonzero(np.isin(owner, sequences))
             is_frame = np.arange(lengths[sequences].max()) < lengths[sequences, None]
             targets = self._targets(sequences, rows, is_frame)

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from xreset.files.checks import frozen
+from xreset.physics.tensors import Tensors
 
 REASONS = (
     "valid",
@@ -50,7 +51,7 @@ class Thresholds:
 
 
 @frozen
-class Measures:
+class Measures(Tensors):
     """Measures of frames; every tensor has the same shape."""
 
     annotated: Tensor
@@ -68,7 +69,7 @@ class Measures:
     table_clearance: Tensor
     """Lowest height of the robot's shapes above the table, at most 2 cm [m]."""
     self_clearance: Tensor
-    """Smallest signed distance between the robot's shapes, at most 2 cm [m]."""
+    """Smallest signed distance between the robot's shapes, at most 0 [m]."""
 
 
 def classify(measures: Measures, thresholds: Thresholds) -> Tensor:

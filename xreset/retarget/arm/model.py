@@ -13,7 +13,7 @@ from torch import Tensor
 
 from xreset.errors import RobotError
 from xreset.files.checks import frozen
-from xreset.geometry.balls import bounding_balls, joined
+from xreset.geometry.balls import bounding_balls, joined, members
 from xreset.geometry.collision import SelfCollision, height_above_table, table_points
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import matrix_to_quat, matvec, quat_angle
@@ -23,7 +23,7 @@ from xreset.retarget.validity import Measures, Thresholds, classify
 from xreset.spec import RobotSpec, TableSpec
 
 _SEARCH = 0.02
-"""Distances between shapes, and heights above the table, are measured up to this one [m]."""
+"""Heights above the table are measured up to this one [m]."""
 _AT_LIMIT = 1e-6
 """A joint this near its limit is at it [rad or m]."""
 
@@ -43,7 +43,7 @@ class ArmTargets(Tensors):
     hand_error: Tensor
     """[S, T] mean fingertip error of the hand's retargeting [m]."""
     hand_clearance: Tensor
-    """[S, T] smallest signed distance between the hand's own shapes [m]; the arm cannot change it."""
+    """[S, T] smallest signed distance between the hand's own shapes, at most 0 [m]; the arm cannot change it."""
 
     @staticmethod
     def of_poses(root_pos: Tensor, root_quat: Tensor, hand_joints: Tensor) -> ArmTargets:
@@ -123,6 +123,7 @@ class ArmModel:
         radii = [support[link][1] for link in links]
         self._count = torch.tensor([len(own) for own in radii], dtype=torch.long)
         """[G] number of support points of each link. The points are stored link by link."""
+        self._first = self._count.cumsum(0) - self._count
         self._points = joined(points, 3)
         self._radii = joined(radii)
         self._middles, self._reach = bounding_balls(points, radii)
@@ -152,10 +153,7 @@ class ArmModel:
         middle = hand_pos + matvec(hand_rot, self._middles)  # [B, G, 3]
         height = pos[:, self._carrier, 2] + (rot[:, self._carrier, 2] * middle).sum(-1)
         frame, link = (height - self._reach < below).nonzero(as_tuple=True)
-        count = self._count[link]
-        position = torch.repeat_interleave(count)
-        before = self._count.cumsum(0)[link] - count.cumsum(0)
-        point = torch.arange(len(position)) + before[position]
+        position, point = members(self._first[link], self._count[link])
         row = frame[position]
         own = link[position]
         carrier = self._carrier[own]
@@ -171,9 +169,9 @@ class ArmModel:
         return low[order[is_first]]
 
     def hand_clearance(self, hand_joints: Tensor) -> Tensor:
-        """[...] smallest signed distance between the hand's shapes that can collide in physics [m]."""
+        """[...] smallest signed distance between the hand's shapes that can collide in physics, at most 0 [m]."""
         poses = self.hand.link_poses(hand_joints.flatten(0, -2)).numpy()
-        return torch.as_tensor(self._hand_collision.clearance(poses, _SEARCH)).view(
+        return torch.as_tensor(self._hand_collision.clearance(poses, 0.0)).view(
             hand_joints.shape[:-1]
         )
 
@@ -211,9 +209,7 @@ class ArmProblem(ArmTargets):
         height = poses.new_full((len(poses),), _SEARCH).scatter_reduce(
             0, low.frame, low.height, "amin"
         )
-        clearance = torch.as_tensor(model.arm_collision.clearance(poses.numpy(), _SEARCH)).view(
-            shape
-        )
+        clearance = torch.as_tensor(model.arm_collision.clearance(poses.numpy(), 0.0)).view(shape)
         root = carriers[:, 0]
         at_limit = (joints <= model.lower + _AT_LIMIT) | (joints >= model.upper - _AT_LIMIT)
         return Measures(

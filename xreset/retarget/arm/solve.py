@@ -83,12 +83,15 @@ def track(
     )
     forwards = branches(problem)
     joints, worth = best_path(problem, forwards)
-    failing = (problem.reasons(joints) > REASONS.index("hand error")).any(dim=1).nonzero()[:, 0]
-    if len(failing):
-        joints[failing] = _better_paths(
-            problem[failing], forwards[failing], joints[failing], worth[failing]
-        )
-    return joints, problem.measures(joints)
+    measures = problem.measures(joints)
+    reason = classify(measures, thresholds)
+    failing = (reason > REASONS.index("hand error")).any(dim=1).nonzero()[:, 0]
+    if len(failing) and (problem.annotated.shape[1] > 1 or problem.config.reseeds):
+        part = problem[failing]
+        better = _better_paths(part, forwards[failing], joints[failing], worth[failing])
+        joints[failing] = better
+        measures[failing] = part.measures(better)
+    return joints, measures
 
 
 class _Job(NamedTuple):
@@ -353,22 +356,26 @@ def spread_over(flags: Tensor, count: int) -> tuple[Tensor, Tensor]:
 # One frame ------------------------------------------------------------------------------------------------------------
 
 
-def solve(frame: ArmProblem, q: Tensor, iterations: int, previous: Tensor | None = None) -> Tensor:
-    """[B, n] joints that minimize the cost of one frame, by Levenberg-Marquardt from ``q``. Every element of the batch
-    has its own damping.
+def solve(
+    frame: ArmProblem, start: Tensor, iterations: int, previous: Tensor | None = None
+) -> Tensor:
+    """[B, n] joints that minimize the cost of one frame, by Levenberg-Marquardt. Every element of the batch has its own
+    damping.
 
     A joint at a limit stays there while the cost pulls it outwards. Steps are clamped to the limits.
 
     Args:
         frame: the problem of one frame, without the axis T.
-        q: [B, n] first guess.
+        start: [B, n] first guess.
         iterations: largest number of steps.
         previous: [B, n] joints of the frame before; None where there is none.
     """
     model = frame.model
 
-    def evaluate(q: Tensor, _: Tensor) -> Quadratic:
-        return system(frame, q, previous)
+    def evaluate(q: Tensor, rows: Tensor) -> Quadratic:
+        if len(rows) == len(start):
+            return system(frame, q, previous)
+        return system(frame[rows], q, None if previous is None else previous[rows])
 
     def step(q: Tensor, here: Quadratic, damping: Tensor) -> Tensor:
         free = free_to_move(q, here.gradient, model.lower, model.upper)
@@ -377,10 +384,9 @@ def solve(frame: ArmProblem, q: Tensor, iterations: int, previous: Tensor | None
         return moved.clamp(model.lower, model.upper)
 
     def done(before: Tensor, after: Tensor, *_: Tensor) -> Tensor:
-        # the whole batch ends together, so it keeps its size
-        return ((after - before).abs() < _CONVERGED).all().expand(len(before))
+        return ((after - before).abs() < _CONVERGED).all(dim=1)
 
-    return minimize(q, evaluate, step, done, iterations, damping_range=(1e-9, 1e9))
+    return minimize(start, evaluate, step, done, iterations, damping_range=(1e-9, 1e9))
 
 
 def system(frame: ArmProblem, q: Tensor, previous: Tensor | None = None) -> Quadratic:

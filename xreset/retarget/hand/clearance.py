@@ -7,20 +7,18 @@ variables.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from xreset.files.checks import frozen
-from xreset.geometry.balls import STAND_IN
+from xreset.geometry.balls import STAND_IN, members
 from xreset.geometry.collision import height_above_table
 from xreset.geometry.fields import DistanceFields
-from xreset.geometry.kinematics import PointJacobian
-from xreset.geometry.rotations import matvec
+from xreset.geometry.rotations import matvec, turned
 from xreset.physics.tensors import Tensors
-from xreset.retarget.hand.model import HandModel
+from xreset.retarget.hand.model import Bodies, HandModel
 
 
 @frozen
@@ -50,7 +48,7 @@ class Objects(NamedTuple):
 
     def local(self, points: Tensor, frame: Tensor) -> Tensor:
         """[..., 3] points in the mesh frame of the object of their frame [...]."""
-        return matvec(self.rot[frame].mT, points - self.pos[frame])
+        return turned(self.rot[frame].mT, points - self.pos[frame])
 
     def signed_distance(self, points: Tensor, frame: Tensor) -> tuple[Tensor, Tensor]:
         """See :meth:`DistanceFields.signed_distance`; points [N, 3] of frames [N] and gradients [N, 3] in the world."""
@@ -59,17 +57,10 @@ class Objects(NamedTuple):
         )
         return distance, matvec(self.rot[frame], slope)
 
-    def nearer(self, points: Tensor, frame: Tensor, limit: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """See :meth:`DistanceFields.nearer`; points [N, 3] of frames [N] and gradients [A, 3] in the world."""
-        near, distance, slope = self.fields.nearer(
-            self.local(points, frame), self.object_index[frame], limit
-        )
-        return near, distance, matvec(self.rot[frame[near]], slope)
-
 
 def too_near(
     model: HandModel,
-    bodies: PointJacobian,
+    bodies: Bodies,
     objects: Objects,
     considered: Tensor,
     object_clearance: float,
@@ -77,7 +68,7 @@ def too_near(
 ) -> Distances:
     """Find balls too near to the object, below the table's top, or too deep in each other.
 
-    A bounding ball around each link excludes most links at once.
+    Boxes around the links exclude most links at once.
 
     Args:
         model: the hand.
@@ -87,38 +78,26 @@ def too_near(
         object_clearance: distance that balls keep from the object [m].
         self_depth: allowed depth of balls in other links [m].
     """
-    balls = model.balls
-    bounds = bodies.pos[:, model.group_body] + matvec(
-        bodies.rot[:, model.group_body], balls.bound_centers
+    together = Distances.cat(
+        (
+            _below_table(model, bodies, considered),
+            _at_object(model, bodies, objects, considered, object_clearance),
+            _in_each_other(model, bodies, considered, self_depth),
+        )
     )
-
-    def below_table(centers: Tensor, frame: Tensor, radii: Tensor) -> tuple[Tensor, ...]:
-        height = height_above_table(centers, radii, model.table)
-        near = (height < 0).nonzero()[:, 0]
-        up = centers.new_tensor([0.0, 0.0, 1.0]).expand(len(near), 3)
-        return near, height[near], up
-
-    over_table = considered[:, None] & (bounds[..., 2] < balls.bound_radii)
-    found = (
-        *_outside(model, bodies, over_table, below_table, 0),
-        *_at_object(model, bodies, objects, considered, object_clearance),
-        *_in_each_other(model, bodies, bounds, considered, self_depth),
-    )
-    together = Distances.cat(found)
     order = together.number.argsort(stable=True)
     return together[order[together.frame[order].argsort(stable=True)]]
 
 
-def object_depth(model: HandModel, bodies: PointJacobian, objects: Objects) -> Tensor:
+def object_depth(model: HandModel, bodies: Bodies, objects: Objects) -> Tensor:
     """[B] largest depth of the hand's balls in the object [m], 0 outside it; arguments as of :func:`too_near`."""
     every = torch.ones(len(bodies.pos), dtype=torch.bool, device=bodies.pos.device)
     depth = bodies.pos.new_zeros(len(every))
-    for found in _at_object(model, bodies, objects, every, 0.0):
-        depth = depth.scatter_reduce(0, found.frame, -found.value, "amax")
-    return depth
+    found = _at_object(model, bodies, objects, every, 0.0)
+    return depth.scatter_reduce(0, found.frame, -found.value, "amax")
 
 
-def contact_distance(model: HandModel, bodies: PointJacobian, points: Tensor) -> Tensor:
+def contact_distance(model: HandModel, bodies: Bodies, points: Tensor) -> Tensor:
     """Return the distances between the hand and points that its keypoints should touch.
 
     Args:
@@ -145,118 +124,133 @@ def contact_distance(model: HandModel, bodies: PointJacobian, points: Tensor) ->
     return distance
 
 
+def _below_table(model: HandModel, bodies: Bodies, considered: Tensor) -> Distances:
+    """Return the heights of balls that are below the table's top."""
+    balls = model.balls
+    rot = bodies.rot[:, model.group_body]
+    middle = (bodies.pos[:, model.group_body] + turned(rot, balls.middles))[..., 2]
+    reach = (rot[:, :, 2].abs() * balls.half_sizes).sum(-1)
+    frame, link = (considered[:, None] & (middle < reach)).nonzero(as_tuple=True)
+    owner, ball = members(balls.first[link], balls.count[link])
+    centers = model.ball_centers(bodies, frame[owner], ball)
+    height = height_above_table(centers, balls.radii[ball], model.table)
+    low = height < 0
+    frame = frame[owner[low]]
+    ball = ball[low]
+    up = centers.new_tensor([0.0, 0.0, 1.0]).expand(len(ball), 3)
+    body = model.group_body[balls.link[ball]]
+    slope = bodies.slope(frame, centers[low], up, body)
+    return Distances(frame=frame, value=height[low], slope=slope, number=ball)
+
+
 def _at_object(
-    model: HandModel,
-    bodies: PointJacobian,
-    objects: Objects,
-    considered: Tensor,
-    clearance: float,
-) -> Iterator[Distances]:
-    """Yield the distances of each link's balls that are nearer to the object than ``clearance`` [m]."""
+    model: HandModel, bodies: Bodies, objects: Objects, considered: Tensor, clearance: float
+) -> Distances:
+    """Return the distances of balls that are nearer to the object than ``clearance`` [m]."""
     balls = model.balls
-    bounds = bodies.pos[:, model.group_body] + matvec(
-        bodies.rot[:, model.group_body], balls.bound_centers
+    fields = objects.fields
+    frame, link = considered[:, None].expand(-1, len(balls.links)).nonzero(as_tuple=True)
+    body = model.group_body[link]
+    inverse = objects.rot[frame].mT
+    turn = inverse @ bodies.rot[frame, body]
+    shift = turned(inverse, bodies.pos[frame, body] - objects.pos[frame])
+    meet = _boxes_meet(model, turn, shift, link, fields, objects.object_index[frame], clearance)
+    frame = frame[meet]
+    owner, ball = members(balls.first[link[meet]], balls.count[link[meet]])
+    local = turned(turn[meet][owner], balls.centers[ball]) + shift[meet][owner]
+    frame = frame[owner]
+    near, distance, away = fields.nearer(
+        local, objects.object_index[frame], balls.radii[ball] + clearance
     )
-    every = torch.arange(len(bounds), device=bounds.device)[:, None].expand(bounds.shape[:2])
-    from_box = objects.fields.box_distance(
-        objects.local(bounds, every), objects.object_index[every]
+    frame = frame[near]
+    ball = ball[near]
+    direction = turned(objects.rot[frame], away)
+    centers = model.ball_centers(bodies, frame, ball)
+    return Distances(
+        frame=frame,
+        value=distance - balls.radii[ball] - clearance,
+        slope=bodies.slope(frame, centers, direction, model.group_body[balls.link[ball]]),
+        number=len(balls.radii) + ball,
     )
-
-    def in_object(centers: Tensor, frame: Tensor, radii: Tensor) -> tuple[Tensor, ...]:
-        near, distance, direction = objects.nearer(centers, frame, radii + clearance)
-        return near, distance - radii[near] - clearance, direction
-
-    candidates = considered[:, None] & (from_box < balls.bound_radii + clearance)
-    yield from _outside(model, bodies, candidates, in_object, len(balls.radii))
-
-
-def _moved(rot: Tensor, pos: Tensor, points: Tensor) -> Tensor:
-    """[B N, 3] points [N, 3] in each of the poses rot [B, 3, 3], pos [B, 3]."""
-    return (points @ rot.mT + pos[:, None]).flatten(0, 1)
-
-
-def _outside(
-    model: HandModel,
-    bodies: PointJacobian,
-    candidates: Tensor,
-    measure: Callable[[Tensor, Tensor, Tensor], tuple[Tensor, ...]],
-    first: int,
-) -> Iterator[Distances]:
-    """Yield the distances of each link's balls from something outside the hand.
-
-    Args:
-        model: the hand.
-        bodies: its B configurations.
-        candidates: [B, G] the links that may be too near.
-        measure: returns the indices of the balls that are too near, their distances, and the directions away from the
-            other body, given centers [N, 3], frames [N] and radii [N] of balls.
-        first: number of the first ball.
-    """
-    balls = model.balls
-    for link, own in enumerate(balls.slices):
-        frames = candidates[:, link].nonzero()[:, 0]
-        body = model.group_body[link]
-        radii = balls.radii[own]
-        centers = _moved(bodies.rot[frames, body], bodies.pos[frames, body], balls.centers[own])
-        frame = frames.repeat_interleave(len(radii))
-        near, value, direction = measure(centers, frame, radii.repeat(len(frames)))
-        frame = frame[near]
-        slope = model.point_slope(bodies, frame, body, centers[near], direction)
-        number = first + own.start + near % len(radii)
-        yield Distances(frame=frame, value=value, slope=slope, number=number)
 
 
 def _in_each_other(
-    model: HandModel,
-    bodies: PointJacobian,
-    bounds: Tensor,
-    considered: Tensor,
-    self_depth: float,
-) -> Iterator[Distances]:
-    """Yield the distances of each link's guards from the links that they must not enter."""
+    model: HandModel, bodies: Bodies, considered: Tensor, self_depth: float
+) -> Distances:
+    """Return the distances of guards from the links that they must not enter."""
     balls = model.balls
-    fields = balls.fields
+    margin = STAND_IN - self_depth
     a, b = balls.link_pairs.unbind(1)
-    reach = balls.bound_radii + STAND_IN - self_depth
-    near = (bounds[:, a] - bounds[:, b]).norm(dim=-1) < reach[a] + balls.bound_radii[b]
+    middles = bodies.pos[:, model.group_body] + turned(
+        bodies.rot[:, model.group_body], balls.middles
+    )
+    reach = balls.half_sizes.norm(dim=-1)
+    apart = (middles[:, a] - middles[:, b]).norm(dim=-1)
+    near = apart < reach[a] + reach[b] + max(margin, 0.0) + balls.fields.spacing
     frame, pair = (near & considered[:, None]).nonzero(as_tuple=True)
     # The guards of the first link of a pair are looked at in the frame of the second.
-    inverse = bodies.rot[frame, model.group_body[b[pair]]].mT
-    origin = bodies.pos[frame, model.group_body[b[pair]]]
-    middle = matvec(inverse, bounds[frame, a[pair]] - origin)
-    near = fields.box_distance(middle, b[pair]) < reach[a[pair]]
-    frame = frame[near]
-    pair = pair[near]
-    inverse = inverse[near]
-    first = model.group_body[a[pair]]
-    turn = inverse @ bodies.rot[frame, first]
-    shift = matvec(inverse, bodies.pos[frame, first] - origin[near])
+    first = model.group_body[a]
+    second = model.group_body[b]
+    inverse = bodies.rot[frame, second[pair]].mT
+    turn = inverse @ bodies.rot[frame, first[pair]]
+    shift = turned(inverse, bodies.pos[frame, first[pair]] - bodies.pos[frame, second[pair]])
+    meet = _boxes_meet(model, turn, shift, a[pair], balls.fields, b[pair], margin)
+    frame = frame[meet]
+    pair = pair[meet]
+    owner, guard = members(balls.first_guard[a[pair]], balls.guard_count[a[pair]])
+    ball = balls.guards[guard]
+    local = turned(turn[meet][owner], balls.centers[ball]) + shift[meet][owner]
+    near, distance, away = balls.fields.nearer(
+        local, b[pair[owner]], balls.guard_radii[guard] - self_depth
+    )
+    frame = frame[owner[near]]
+    pair = pair[owner[near]]
+    guard = guard[near]
+    direction = turned(bodies.rot[frame, second[pair]], away)
+    centers = model.ball_centers(bodies, frame, ball[near])
+    return Distances(
+        frame=frame,
+        value=distance - balls.guard_radii[guard] + self_depth,
+        slope=bodies.slope(frame, centers, direction, first[pair], second[pair]),
+        number=2 * len(balls.radii) + pair * len(balls.guards) + guard,
+    )
 
-    for link, own in enumerate(balls.guard_slices):
-        mine = (a[pair] == link).nonzero()[:, 0]
-        body = model.group_body[link]
-        guards = balls.guards[own]
-        radii = balls.guard_radii[own]
-        centers = _moved(turn[mine], shift[mine], balls.centers[guards])
-        limit = (radii - self_depth).repeat(len(mine))
-        deep, distance, away = fields.nearer(
-            centers, b[pair[mine]].repeat_interleave(len(radii)), limit
-        )
-        mine = mine[deep.div(len(radii), rounding_mode="floor")]
-        guard = deep % len(radii)
-        solid = model.group_body[b[pair[mine]]]
-        row = frame[mine]
-        direction = matvec(bodies.rot[row, solid], away)
-        centers = model.ball_centers(bodies, row, guards[guard])
-        slope = model.point_slope(bodies, row, body, centers, direction)
-        slope = slope - model.point_slope(bodies, row, solid, centers, direction)
-        value = distance - radii[guard] + self_depth
-        number = 2 * len(balls.radii) + pair[mine] * len(balls.guards) + own.start + guard
-        yield Distances(frame=row, value=value, slope=slope, number=number)
+
+def _boxes_meet(
+    model: HandModel,
+    turn: Tensor,
+    shift: Tensor,
+    link: Tensor,
+    fields: DistanceFields,
+    index: Tensor,
+    margin: float,
+) -> Tensor:
+    """[K] whether the box around a link's balls may be nearer to the bounding box of a field than a margin.
+
+    They are not if one of the six directions of their sides separates them (Gottschalk et al. 1996, OBBTree).
+
+    Args:
+        model: the hand.
+        turn: [K, 3, 3] rotation of the link in the field's frame.
+        shift: [K, 3] origin of the link in the field's frame.
+        link: [K]
+        fields: the fields.
+        index: [K] the field.
+        margin: distance [m].
+    """
+    half = model.balls.half_sizes[link] + max(margin, 0.0) + fields.spacing
+    low = fields.low[index]
+    high = fields.high[index]
+    field_half = (high - low) / 2
+    between = turned(turn, model.balls.middles[link]) + shift - (low + high) / 2
+    extent = turn.abs()
+    in_field = (between.abs() <= field_half + turned(extent, half)).all(-1)
+    in_link = (turned(turn.mT, between).abs() <= half + turned(extent.mT, field_half)).all(-1)
+    return in_field & in_link
 
 
 def pad_distances(
-    model: HandModel, bodies: PointJacobian, objects: Objects, frame: Tensor
+    model: HandModel, bodies: Bodies, objects: Objects, frame: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Compute how far a jaw's pads are from the object.
 
@@ -274,8 +268,6 @@ def pad_distances(
     frame = frame.repeat_interleave(count)
     centers = model.ball_centers(bodies, frame, ball)
     distance, direction = objects.signed_distance(centers, frame)
-    slope = model.point_slope(
-        bodies, frame, model.group_body[model.balls.link[ball]], centers, direction
-    )
+    slope = bodies.slope(frame, centers, direction, model.group_body[model.balls.link[ball]])
     value = distance - model.balls.radii[ball]
     return value.view(-1, count), slope.view(-1, count, slope.shape[-1])

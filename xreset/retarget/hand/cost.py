@@ -14,7 +14,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from xreset.geometry.kinematics import PointJacobian
 from xreset.geometry.rotations import (
     matvec,
     quat_conjugate,
@@ -25,7 +24,7 @@ from xreset.geometry.rotations import (
 from xreset.retarget.hand import terms
 from xreset.retarget.hand.clearance import Distances, Objects, pad_distances, too_near
 from xreset.retarget.hand.config import HandWeights
-from xreset.retarget.hand.model import HandModel, HandState, HandTargets
+from xreset.retarget.hand.model import Bodies, HandModel, HandState, HandTargets
 from xreset.retarget.least_squares import Quadratic
 
 _FRAMES_PER_CHUNK = {"cpu": 256, "cuda": 2048}
@@ -109,12 +108,12 @@ def _frame_costs(
 
 
 def _keypoint_terms(
-    model: HandModel, targets: HandTargets, config: HandWeights, bodies: PointJacobian
+    model: HandModel, targets: HandTargets, config: HandWeights, bodies: Bodies
 ) -> Quadratic:
     """Compute the terms of the keypoints and of the bones between them."""
     scale = config.length_scale
     x = bodies.pos[:, model.keypoint_body] / scale
-    J = bodies.linear[:, model.keypoint_body] / scale
+    J = bodies.moves(model.keypoint_body).div_(scale)  # [B, P, 3, m]
     human = targets.keypoints.flatten(0, 1) / scale
     touched = targets.contact_points.flatten(0, 1) / scale
     on = targets.annotated.flatten().to(x.dtype)[:, None]
@@ -134,14 +133,15 @@ def _keypoint_terms(
     contact = terms.contact(x, touched, in_contact, margin, config.contact_knee / scale)
     on_points = terms.difference(x, human, alignment) + contact
 
-    moves = torch.cat((J[:, b] - J[:, a], J), dim=1)  # [B, C + P, 3, n]
+    moves = torch.cat((J[:, b] - J[:, a], J), dim=1)  # [B, C + P, 3, m]
     curvature = torch.cat((on_bones.curvature, on_points.curvature), dim=1)
     slope = torch.cat((on_bones.gradient, on_points.gradient), dim=1)
     rows = moves.flatten(1, 2)
+    coupling = bodies.coupling
     return Quadratic(
         cost=on_bones.cost + on_points.cost,
-        gradient=matvec(rows.mT, slope.flatten(1, 2)),
-        curvature=rows.mT @ (curvature @ moves).flatten(1, 2),
+        gradient=matvec(rows.mT, slope.flatten(1, 2)) @ coupling,
+        curvature=coupling.mT @ (rows.mT @ (curvature @ moves).flatten(1, 2)) @ coupling,
     )
 
 

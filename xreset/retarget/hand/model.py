@@ -20,8 +20,8 @@ from xreset.files.checks import frozen
 from xreset.geometry.balls import hand_balls
 from xreset.geometry.collision import SelfCollision
 from xreset.geometry.fields import DistanceFields
-from xreset.geometry.kinematics import Kinematics, PointJacobian
-from xreset.geometry.rotations import homogeneous, matvec, quat_to_matrix
+from xreset.geometry.kinematics import Kinematics
+from xreset.geometry.rotations import homogeneous, matvec, quat_to_matrix, turned
 from xreset.physics.tensors import Tensors
 from xreset.spec import FINGERS, KEYPOINTS, RobotSpec, TableSpec
 
@@ -177,53 +177,81 @@ class HandModel:
         """[..., P, 3] positions of the links that follow keypoints [m]."""
         return self.kinematics.points(state.joints, self.keypoint_links, base=state.root)
 
-    def bodies(self, state: HandState) -> PointJacobian:
-        """Compute the poses of the hand's links in B frames, and their Jacobians.
+    def bodies(self, state: HandState) -> Bodies:
+        """Compute the poses of the hand's links in B frames, and how they change with the variables.
 
         Variables: joints, then translation of the root, then rotation of the root about its origin (both along the
         world's axes).
         """
-        links = self.kinematics.jacobian(state.joints, self._bodies, base=state.root)
-        identity = torch.eye(3, dtype=links.pos.dtype, device=links.pos.device).expand(
-            *links.pos.shape[:-1], 3, 3
-        )
-        # row i: velocity e_i x r of a link, r away from the root, as the root rotates about axis i
-        by_rotation = torch.linalg.cross(
-            identity, (links.pos - state.root_pos[:, None])[..., None, :]
-        )
-        return links._replace(
-            linear=torch.cat((links.linear, identity, by_rotation.mT), dim=-1),
-            angular=torch.cat((links.angular, torch.zeros_like(identity), identity), dim=-1),
+        links = self.kinematics.twists(state.joints, self._bodies, state.root)
+        of_root = torch.eye(6, dtype=links.pos.dtype, device=links.pos.device)
+        return Bodies(
+            pos=links.pos,
+            rot=links.rot,
+            origin=state.root_pos,
+            twists=torch.cat((links.twists, of_root.expand(len(links.pos), 6, 6)), dim=-1),
+            carried=torch.nn.functional.pad(links.carried, (0, 6), value=1.0),
+            coupling=torch.block_diag(links.coupling, of_root),
         )
 
-    def ball_centers(self, bodies: PointJacobian, frame: Tensor, ball: Tensor) -> Tensor:
-        """[..., 3] centers in the world of balls [...] in frames [...]."""
+    def ball_centers(self, bodies: Bodies, frame: Tensor, ball: Tensor) -> Tensor:
+        """[A, 3] centers in the world of balls [A] in frames [A]."""
         body = self.group_body[self.balls.link[ball]]
-        return bodies.pos[frame, body] + matvec(bodies.rot[frame, body], self.balls.centers[ball])
+        return bodies.pos[frame, body] + turned(bodies.rot[frame, body], self.balls.centers[ball])
 
-    def point_slope(
+
+@frozen
+class Bodies:
+    """The hand's links in B frames, and how they change with the variables."""
+
+    pos: Tensor
+    """[B, L, 3] origin of each link."""
+    rot: Tensor
+    """[B, L, 3, 3] rotation of each link."""
+    origin: Tensor
+    """[B, 3] origin of the root."""
+    twists: Tensor
+    """[B, 6, m] velocity of the point at the root's origin, and angular velocity, of a body that a joint or the root
+    moves: m moving joints and directions of the root."""
+    carried: Tensor
+    """[L, m] 1: the link is moved; 0: it is not."""
+    coupling: Tensor
+    """[m, n] velocities of the moving joints and the root by those of the variables."""
+
+    def slope(
         self,
-        bodies: PointJacobian,
         frame: Tensor,
-        body: Tensor,
         point: Tensor,
         direction: Tensor,
+        body: Tensor,
+        other: Tensor | None = None,
     ) -> Tensor:
         """[A, n] derivative of a link's point along a direction: n . (v + w x r) = n . v + (r x n) . w.
 
         Args:
-            bodies: links of the hand.
             frame: [A]
-            body: [A] or [] the point's link, as an index of ``bodies``.
             point: [A, 3] in the world.
             direction: [A, 3] unit vectors n.
+            body: [A] the point's link.
+            other: [A] link whose movement at this point is subtracted.
         """
-        lever = torch.linalg.cross(point - bodies.pos[frame, body], direction)
-        along = (
-            direction[:, None] @ bodies.linear[frame, body]
-            + lever[:, None] @ bodies.angular[frame, body]
+        lever = torch.linalg.cross(point - self.origin[frame], direction)
+        along = torch.cat((direction, lever), dim=-1)[:, None] @ self.twists[frame]
+        moved = self.carried[body]
+        if other is not None:
+            moved = moved - self.carried[other]
+        return (along[:, 0] * moved) @ self.coupling
+
+    def moves(self, body: Tensor) -> Tensor:
+        """[B, P, 3, m] velocities of the origins of links [P], by those of the moving joints and the root."""
+        lever = (self.pos[:, body] - self.origin[:, None])[..., None, :]
+        identity = torch.eye(3, dtype=lever.dtype, device=lever.device).expand(
+            *lever.shape[:2], 3, 3
         )
-        return along[:, 0]
+        by_rotation = torch.linalg.cross(identity, lever).mT
+        per_twist = torch.cat((identity, by_rotation), dim=-1)
+        moves = (per_twist.flatten(1, 2) @ self.twists).unflatten(1, (-1, 3))
+        return moves.mul_(self.carried[body][:, None])
 
 
 def predicted_gigabytes(model: HandModel) -> float:

@@ -32,6 +32,9 @@ _CLEARANCE_GROWTH = (0.01, 0.1)
 that may pass through the object at first finds the right side of a handle or a rim."""
 _GROWTH_STEPS = 6
 """Largest number of Levenberg-Marquardt steps of each earlier stage."""
+_FIRST_DAMPING = 1.0
+"""Damping of the first step of each stage. Longer steps touch the object elsewhere, so that most would be refused: from
+1e-3 on, half of all steps are."""
 
 
 def retarget_hand(
@@ -81,7 +84,7 @@ def _minimize(
         gain = (cost - tried) / cost.clamp_min(1e-12)
         return ((tried < cost) & (gain < config.tolerance)) | (damping > 1e6)
 
-    return minimize(start, evaluate, step, done, config.iterations)
+    return minimize(start, evaluate, step, done, config.iterations, damping=_FIRST_DAMPING)
 
 
 def _align_root(model: HandModel, human: Tensor) -> tuple[Tensor, Tensor]:

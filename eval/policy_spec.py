@@ -15,14 +15,14 @@ from xreset.geometry.description import load_robot
 from xreset.learning.exported import PolicyFile, find_policy
 from xreset.live.deploy import deployed_graph, is_deployed, made_for, training_of
 from xreset.objects.catalogue import object_names
-from xreset.policy.onnx_policy import OnnxPolicy, Policy, check_contract, check_robot
+from xreset.policy.onnx_policy import OnnxPolicy, Policy, check_contract, check_robot_of
 from xreset.policy.shipped import graph_of
 from xreset.resets.bank import ResetBank
 from xreset.retarget.file import Retargeted
 from xreset.runtime import Controller
-from xreset.runtime.contract import POLICY
 from xreset.spec import ObjectSpec, RobotSpec
 from xreset.task.config import TaskConfig, evaluation_task
+from xreset.task.contract import Contract
 
 if TYPE_CHECKING:  # functions import torch, which playing a deployed policy does not need
     from xreset.env.manipulation import ManipulationEnv
@@ -190,57 +190,49 @@ def load_policy(
     if str(policy) in BASELINES:
         return _baseline(str(policy), robot, seed)
     found = find_policy(policy, also=BASELINES)
-    return _deployed(found, robot) if is_deployed(found.content) else _trained(found, robot)
-
-
-def _trained(found: PolicyFile, robot: str | Path | None) -> PolicySpec:
-    """Return a policy that xreset has trained."""
-    loaded = OnnxPolicy(found.path, found.content)
-    contract = loaded.contract
     run = found.run
+    is_graph = is_deployed(found.content)
+    contract, start = _opened_graph(found) if is_graph else _opened(found)
     spec = load_robot(robot or (run.robot if run else contract.robot))
-    check_robot(str(found.path), contract, spec)
+    if not is_graph:
+        check_robot_of(str(found.path), contract, spec)
+    elif contract.joint_names != spec.joint_names:
+        raise PolicyError(
+            f"{found.path} has the joints {', '.join(contract.joint_names)}, but the robot {spec.name!r} has "
+            f"{', '.join(spec.joint_names)}."
+        )
     return PolicySpec(
-        name=found.name,
-        start=lambda motion: loaded.another(),
+        name=found.folder_name if is_graph else found.name,
+        start=start,
         robot=spec,
         task=contract.task,
         folder=found.results / "eval",
         meshes=Path(run.meshes) if run and run.meshes else None,
         objects=contract.objects,
-        hash=loaded.hash,
-        content=loaded.content,
+        hash=sha256(found.content).hexdigest(),
+        content=found.content,
     )
 
 
-def _deployed(found: PolicyFile, robot: str | Path | None) -> PolicySpec:
-    """Return a policy whose file is a graph from readings to joint targets, whoever trained it."""
-    file = found.path
-    controller = Controller(found.content, str(file))
-    contract = controller.contract
-    spec = load_robot(robot or contract["robot"])
-    names = tuple(joint["name"] for joint in contract["joints"])
-    if names != spec.joint_names:
-        raise PolicyError(
-            f"{file} has the joints {', '.join(names)}, but the robot {spec.name!r} has {', '.join(spec.joint_names)}."
-        )
+Start = Callable[[Retargeted | None], Policy]
+
+
+def _opened(found: PolicyFile) -> tuple[Contract, Start]:
+    """Return the contract of a policy that xreset has trained, and what starts it."""
+    loaded = OnnxPolicy(found.path, found.content)
+    return loaded.contract, lambda motion: loaded.another()
+
+
+def _opened_graph(found: PolicyFile) -> tuple[Contract, Start]:
+    """Return the same of a policy whose file is a graph from readings to joint targets, whoever trained it."""
+    source = str(found.path)
 
     def start(motion: Retargeted | None) -> Policy:
         from xreset.live.engine import GraphPolicy
 
-        return GraphPolicy(Controller(found.content, str(file)))
+        return GraphPolicy(Controller(found.content, source))
 
-    trained = training_of(controller, str(file))
-    return PolicySpec(
-        name=file.parent.resolve().name if file.name == POLICY else found.name,
-        start=start,
-        robot=spec,
-        task=trained.task,
-        folder=found.results / "eval",
-        objects=tuple(contract.get("objects", ())) or trained.objects,
-        hash=sha256(found.content).hexdigest(),
-        content=found.content,
-    )
+    return training_of(Controller(found.content, source), source), start
 
 
 def _baseline(name: str, robot: str | Path | None, seed: int) -> PolicySpec:

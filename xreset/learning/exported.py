@@ -8,8 +8,8 @@ from pathlib import Path
 
 from xreset.errors import PolicyError
 from xreset.files.checks import frozen
-from xreset.files.storage import file_hash, read_json
-from xreset.learning.run import RunInfo, checkpoints, latest_checkpoint, read_run
+from xreset.files.storage import file_hash
+from xreset.learning.run import RunInfo, checkpoints, played_checkpoint, read_run
 from xreset.policy.onnx_policy import OnnxPolicy, policy_content
 from xreset.policy.shipped import results_folder, shipped
 from xreset.runtime.contract import POLICY
@@ -29,6 +29,11 @@ class PolicyFile:
     run: RunInfo | None = None
     """The training, where the policy was found in its run folder."""
 
+    @property
+    def folder_name(self) -> str:
+        """Name of the file, or of its folder if the file has the name that every deployed policy has."""
+        return self.path.resolve().parent.name if self.path.name == POLICY else self.name
+
 
 def find_policy(policy: str | Path, *, also: Sequence[str] = ()) -> PolicyFile:
     """Find a run folder's policy, that of a checkpoint, an exported or deployed one, or one that ships with xreset, in
@@ -47,17 +52,9 @@ def find_policy(policy: str | Path, *, also: Sequence[str] = ()) -> PolicyFile:
     if os.path.isdir(path / "runtime"):  # of xreset export deploy
         path = path / POLICY
     if os.path.isdir(path):  # unlike Path.is_dir, it takes names of any length
-        run = read_run(path)
-        file = path / "policy.onnx"
-        content = _content_of_run(path, run)
-        return PolicyFile(name=path.name, path=file, content=content, results=path, run=run)
+        return _policy_of_run(path)
     if path.suffix == ".pt" and path.is_file():
-        folder = path.parent.parent
-        run = read_run(folder)
-        name = f"{folder.name}-{path.stem}"
-        content = _exported(path, run)
-        results = path.with_suffix("")
-        return PolicyFile(name=name, path=path, content=content, results=results, run=run)
+        return _policy_of_checkpoint(path)
     if path.suffix == ".onnx" or os.path.exists(path):
         content = policy_content(path)
         return PolicyFile(name=path.stem, path=path, content=content, results=path.parent)
@@ -78,18 +75,30 @@ def read_policy(policy: str | Path) -> OnnxPolicy:
     return OnnxPolicy(found.path, found.content)
 
 
-def _content_of_run(folder: Path, run: RunInfo) -> bytes:
+def _policy_of_run(folder: Path) -> PolicyFile:
     """Return the policy of the newest checkpoint. A run that was copied without its checkpoints keeps its
     ``policy.onnx``."""
+    run = read_run(folder)
     path = folder / "policy.onnx"
-    if path.exists() and not checkpoints(folder):
-        return policy_content(path)
-    checkpoint = _chosen_before(folder, latest_checkpoint(folder))
-    if path.exists():
-        content = policy_content(path)
-        if file_hash(checkpoint).encode() in content:  # an entry of the metadata, at the end
-            return content
-    return _exported(checkpoint, run)
+    is_copied = path.exists() and not checkpoints(folder)
+    checkpoint = None if is_copied else played_checkpoint(folder)
+    content = policy_content(path) if path.exists() else b""
+    # the hash is an entry of the metadata, at the end
+    if checkpoint is not None and file_hash(checkpoint).encode() not in content:
+        content = _exported(checkpoint, run)
+    return PolicyFile(name=folder.name, path=path, content=content, results=folder, run=run)
+
+
+def _policy_of_checkpoint(checkpoint: Path) -> PolicyFile:
+    folder = checkpoint.parent.parent
+    run = read_run(folder)
+    return PolicyFile(
+        name=f"{folder.name}-{checkpoint.stem}",
+        path=checkpoint,
+        content=_exported(checkpoint, run),
+        results=checkpoint.with_suffix(""),
+        run=run,
+    )
 
 
 def _exported(checkpoint: Path, run: RunInfo) -> bytes:
@@ -97,13 +106,3 @@ def _exported(checkpoint: Path, run: RunInfo) -> bytes:
     from xreset.learning.export import exported_checkpoint
 
     return exported_checkpoint(checkpoint, run)
-
-
-def _chosen_before(folder: Path, newest: Path) -> Path:
-    """Return the checkpoint that ``xreset select`` of 0.1 to 0.3 chose among those that the run still has, or else the
-    newest one."""
-    path = folder / "choice.json"
-    if not path.is_file() or newest.name not in path.read_text():
-        return newest
-    chosen = read_json(path).get("chosen")
-    return next((each for each in checkpoints(folder) if each.name == chosen), newest)

@@ -130,6 +130,17 @@ def latest_checkpoint(folder: Path) -> Path:
     return found[-1]
 
 
+def played_checkpoint(folder: Path) -> Path:
+    """Return the newest checkpoint, or the one that ``xreset select`` of 0.1 to 0.3 chose, if the run still has it and
+    has not gone on since; ``RunError`` if there is none."""
+    newest = latest_checkpoint(folder)
+    path = folder / "choice.json"
+    if not path.is_file() or newest.name not in path.read_text():
+        return newest
+    chosen = read_json(path).get("chosen")
+    return next((each for each in checkpoints(folder) if each.name == chosen), newest)
+
+
 def training_left(folder: Path, iterations: int, minutes: float = math.inf) -> str:
     """Return what is left to do of a training, in words; empty if it is done.
 

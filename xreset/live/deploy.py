@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -194,7 +195,7 @@ def is_deployed(content: bytes) -> bool:
 
 
 def training_of(controller: Controller, source: str) -> Contract:
-    """Return the contract of a deployed policy's training.
+    """Return the contract of a deployed policy's training, with the objects whose points the policy lists, if any.
 
     A policy that was not trained by xreset states none. Its task has the policy's rate, and actions that reach every
     target; nobody states what its observations are called.
@@ -206,22 +207,24 @@ def training_of(controller: Controller, source: str) -> Contract:
     Raises:
         PolicyError: the stated contract is damaged.
     """
+    stated = controller.contract
+    listed = tuple(stated.get("objects", ()))
     trained = controller.metadata.get(METADATA_KEY)
     if trained is not None:
         version = controller.metadata.get(VERSION_KEY)
-        return parsed_contract(source, json.loads(trained), version)
+        contract = parsed_contract(source, json.loads(trained), version)
+        return replace(contract, objects=listed or contract.objects)
     substeps = max(1, round(controller.dt / EVALUATION_TIMESTEP))
     action = ActionConfig(
         arm_step=_ANY, arm_lead=_ANY, hand="relative", hand_step=_ANY, hand_lead=_ANY
     )
-    stated = controller.contract
     return Contract(
         schema=TRAINED,
         robot=stated["robot"],
         robot_fingerprint=str(stated.get("robot_fingerprint")),
         joint_names=tuple(joint["name"] for joint in stated["joints"]),
         fingertip_names=tuple(stated.get("fingertips", ())),
-        objects=(),
+        objects=listed,
         observation_layout={},
         control_dt=controller.dt,
         task=TaskConfig(action=action, timestep=controller.dt / substeps, substeps=substeps),

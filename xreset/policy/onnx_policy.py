@@ -81,7 +81,7 @@ def contract_metadata(contract: Contract) -> dict[str, str]:
     return {METADATA_KEY: json.dumps(asdict(contract)), VERSION_KEY: code_version()}
 
 
-def check_robot(source: str, contract: Contract, robot: RobotSpec) -> None:
+def check_robot_of(source: str, contract: Contract, robot: RobotSpec) -> None:
     """Refuse a policy of another robot; ``PolicyError`` as of :func:`check_contract`."""
     here = replace(
         contract,

@@ -33,6 +33,7 @@ from xreset.spec import ObjectSpec, RobotSpec, SceneSpec, checked_objects
 from xreset.task import observations as obs
 from xreset.task.actions import ActionSpace
 from xreset.task.config import TaskConfig
+from xreset.task.default import TASK
 from xreset.task.reading import Reading, step_log
 from xreset.task.rewards import Reward, RewardFunction, RewardInput
 from xreset.task.terminations import out_of_bounds
@@ -63,7 +64,7 @@ def make_env(
     robot: RobotSpec,
     objects: Sequence[ObjectSpec],
     bank: ResetBank,
-    task: TaskConfig | None = None,
+    task: TaskConfig = TASK,
     *,
     engine: str = "mujoco",
     num_envs: int = 16,
@@ -77,7 +78,7 @@ def make_env(
         objects: the objects of the bank; world i holds object i modulo their number, unless
             ``task.reset.object_share`` gives some objects more worlds.
         bank: where episodes begin, and their goals.
-        task: observations, rewards and ends of episodes; None: the paper's task.
+        task: observations, rewards and ends of episodes; default: those of ``xreset train``.
         engine: name of the engine, as ``xreset engines`` prints it.
         num_envs: N.
         device: where the engine and all tensors live.
@@ -88,7 +89,6 @@ def make_env(
         DemoError: the bank has no demonstration of an object.
         XResetError: ``task.reset.object_share`` names an unknown object, or an object gets no world.
     """
-    task = task or TaskConfig()
     objects = checked_objects(robot, objects)
     check_states(bank, robot, objects)
     scene = make_scene(robot, objects, task)

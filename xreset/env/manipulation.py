@@ -10,7 +10,6 @@ training needs rsl-rl. Evaluations use the same class with another configuration
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import fields
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -400,29 +399,6 @@ class ManipulationEnv:
             object_index=int(self.backend.object_index[world]),
         )
 
-    def snapshot(self) -> dict[str, Tensor]:
-        """Return the state of all worlds on the CPU, without random numbers and warm starts, for :meth:`restore`."""
-        values = self.worlds.buffers | vars(self.backend.state())
-        return {name: value.to("cpu", copy=True) for name, value in values.items()}
-
-    def restore(self, snapshot: dict[str, Tensor]) -> None:
-        """Continue from a snapshot of the same task with as many worlds.
-
-        Raises:
-            XResetError: the snapshot is of another task, or of another number of worlds.
-        """
-        present = self.worlds.buffers | vars(self.backend.state())
-        for name, value in present.items():
-            if name not in snapshot:
-                raise XResetError(f"The snapshot has no {name!r}. Take one of the same task.")
-            _check_shape(f"{name} of the snapshot", snapshot[name], value)
-        for name, value in self.worlds.buffers.items():
-            value.copy_(snapshot[name])
-        self._reset_mask.fill_(True)
-        state = State(**{f.name: snapshot[f.name] for f in fields(State)})
-        self._set_worlds(state.to(self.device))
-        self._reset_mask.zero_()
-
     # Parts
 
     def _task_origin(self, pos: Tensor, quat: Tensor) -> Tensor:
@@ -554,15 +530,9 @@ class ManipulationEnv:
         """Put the worlds to reset into their new states."""
         start = self._new_start
         self._bad_action &= ~self._reset_mask
-        self._set_worlds(
-            State.at_rest(start.joint_pos, start.object_pos, start.object_quat, start.joint_target)
-        )
-
-    def _set_worlds(self, state: State) -> None:
-        """Set states [N, ...] and physical parameters of the worlds to reset."""
         self.backend.set_where(
             self._reset_mask,
-            state,
+            State.at_rest(start.joint_pos, start.object_pos, start.object_quat, start.joint_target),
             Parameters(**self.variation.parameters, object_gravity=self.gravity_fraction),
         )
 

@@ -174,7 +174,7 @@ def _objects_of(data: Data, given: Path) -> tuple[str, ...]:
     if not (given / data.demos).is_file():
         raise FileFormatError(
             f"The archive {given / data.demos} of the study does not exist. Put it there, or give the folder of the "
-            "study's data (--data). Comments in the study file say how archives are made."
+            "study's data (--data). docs/studies.md says how archives are made."
         )
     return tuple(sorted(set(read_demos(given / data.demos).object_name.tolist())))
 

@@ -50,10 +50,11 @@ class Compared:
         return action
 
 
-def compared(name, names=None, seconds=None):
-    """Evaluate a policy with its graph next to it: one demonstration of each object; default: those of the training."""
+def compared(name, names=None, seconds=None, graph=None):
+    """Evaluate a policy with a graph next to it, by default its own: one demonstration of each object; default: those of
+    the training."""
     spec = load_policy(name)
-    played = Compared(spec.start(None), spec.graph)
+    played = Compared(spec.start(None), graph or spec.graph)
     demos = synthesize(names or spec.objects_of(None), 1)
     trial = load_trial(spec, demos, episode_seconds=seconds)
     rollouts = roll_out(played, engine("mujoco", workers=0), trial, episodes=1)

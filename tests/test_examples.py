@@ -16,6 +16,7 @@ import trimesh
 
 import xreset
 from tests.data import InFolder, InOneFolder
+from tests.toy_bank import ONLY_FRAMES
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 NUMBERED = sorted(EXAMPLES.glob("[0-9]*.py"))
@@ -87,8 +88,9 @@ class ShelfTest(InFolder):
     )
     def test_a_shipped_policy_is_filmed_with_an_unseen_object(self):
         trimesh.creation.cylinder(radius=0.035, height=0.09).export(self.folder / "beaker.obj")
-        short = partial(xreset.film, fps=2, size=(320, 240))
-        with mock.patch.object(xreset, "film", short):
+        film = partial(xreset.film, fps=2, size=(320, 240))
+        make_bank = partial(xreset.make_bank, **ONLY_FRAMES)
+        with mock.patch.multiple(xreset, film=film, make_bank=make_bank):
             run("00_film_a_policy", self.folder, "beaker", f"{self.folder}/film.mp4")
         self.assertGreater((self.folder / "film.mp4").stat().st_size, 2_000)
 

@@ -12,7 +12,7 @@ import numpy as np
 from tests.graph_episodes import compared
 from xreset import OnnxPolicy, evaluate, synthesize
 from xreset.eval.policy_spec import BASELINES, load_policy
-from xreset.live.deploy import deploy_contract
+from xreset.live.deploy import deploy_contract, deployed_graph
 from xreset.objects.catalogue import object_names
 from xreset.policy.shipped import card, graph_of, shipped, shipped_graphs
 from xreset.runtime import Controller
@@ -76,12 +76,24 @@ class ShippedPolicyTest(unittest.TestCase):
                 without_graph.remove(name)
                 expected = deploy_contract(spec.robot, spec.task)["joints"]
                 self.assertEqual(Controller(spec.graph).contract["joints"], expected)
-                played, episodes = compared(name, spec.objects_of(None)[:1], seconds=0.5)
-                steps = round(0.5 / spec.task.control_dt)
-                self.assertEqual((len(episodes), len(played.differences)), (1, steps))
-                self.assertLess(np.max(played.differences), 1e-5)
+                self.assert_acts_alike(name, spec.graph)
         for name in without_graph:
             self.assertTrue(load_policy(name).task.vision.cameras, name)
+
+    def assert_acts_alike(self, name, graph):
+        """A graph gives the targets of a policy on the readings of half a second of an evaluation."""
+        spec = load_policy(name)
+        played, episodes = compared(name, spec.objects_of(None)[:1], 0.5, graph)
+        steps = round(0.5 / spec.task.control_dt)
+        self.assertEqual((len(episodes), len(played.differences)), (1, steps))
+        self.assertLess(np.max(played.differences), 1e-5)
+
+    @unittest.skipUnless(find_spec("mujoco"), "mujoco is not installed")
+    @unittest.skipUnless(find_spec("onnxscript"), "onnxscript is not installed")
+    def test_this_version_exports_a_graph_that_acts_as_the_policy(self):
+        spec = load_policy("many-objects")
+        graph = deployed_graph(spec.exported(), spec.robot, spec.task)
+        self.assert_acts_alike("many-objects", graph)
 
     def test_it_still_grasps_and_lifts(self):
         for name, file in shipped().items():

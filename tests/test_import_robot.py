@@ -227,6 +227,10 @@ class Toy(Robots):
         found = errors(folder)
         self.assertEqual(len(found), 4, found)
         self.assertIn("'f1_2' goes from 0.1 to 1.3 with 'f1_1', beyond its own limits", found[0])
+        with self.assertRaisesRegex(
+            RobotError, r"'f1_2' follows 'f1_1' from 1\.8\.\.3, but its own limits"
+        ):
+            self.read("hand.urdf", HAND.replace('offset="0.1"', 'offset="1.8"'))
 
     def test_origins_moved_sideways_do_not_turn_the_palm(self):
         fingers = [_finger(f"f{i}", 0.015) for i in (1, 2, 3)]

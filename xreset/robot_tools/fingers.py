@@ -44,6 +44,8 @@ _WRIST_BEHIND = 0.095
 """[m] The human wrist behind the knuckles."""
 _PALM_BEHIND = 0.04
 """[m] The palm's center behind the knuckles."""
+_END = 0.005
+"""[m] Length of the end of a finger."""
 _SIDE = 0.1
 """A thumb that is less than this share of the fingers' width beside their middle is opposite it."""
 _NARROW = 0.7
@@ -509,8 +511,7 @@ class Hand:
         """[links + 1, 3] the joints and the tip of a finger.
 
         A joint is the point of its axis that is nearest to the middle of its link's shapes: makers put origins anywhere
-        along an axis. The tip is a fixed link called so, or the point of the shapes that is farthest from the last
-        joint.
+        along an axis. The tip is a fixed link called so, or the middle of the shapes' end, far from the last joint.
         """
         points = [self._on_axis(link, self._surface([link])) for link in finger.links]
         tips = [name for name in finger.fixed_links if "tip" in name.lower()]
@@ -526,7 +527,9 @@ class Hand:
         middle = bounding_ball(cloud)[0]
         away = middle - self._on_axis(last, cloud)
         away /= max(np.linalg.norm(away), 1e-9)
-        return np.array([*points, middle + away * ((cloud - middle) @ away).max()])
+        along = (cloud - middle) @ away
+        end = bounding_ball(cloud[along > along.max() - _END])[0]  # jaws may taper to one side
+        return np.array([*points, end + away * (along.max() - (end - middle) @ away)])
 
     def _on_axis(self, link: str, cloud: np.ndarray) -> np.ndarray:
         """[3] the point of the axis before a link that is nearest to the middle of points; the origin if there is

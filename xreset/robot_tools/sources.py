@@ -338,6 +338,11 @@ def _with_sources(tree: RobotTree, path: Path, notes: list[str]) -> RobotTree:
         if low < joint.lower or high > joint.upper:
             limits = f"{low:.3g}..{high:.3g}"
             stated = f"{joint.lower:.3g}..{joint.upper:.3g}"
+            if joint.lower < joint.upper and (low >= joint.upper or high <= joint.lower):
+                raise RobotError(
+                    f"{path}: {name!r} follows {mimic.source!r} from {limits}, but its own limits are {stated}. The "
+                    "file contradicts itself: correct the coupling (in an MJCF also `ref`), or the limits."
+                )
             if limits != stated:
                 notes.append(
                     f"{name!r} has the limits {limits} that {mimic.source!r} gives it, in place of {stated}"

@@ -12,13 +12,14 @@ from xreset.cli._terminal import console, show_notes
 from xreset.cli._verbs import REQUIRED, verb
 from xreset.geometry.description import load_robot
 from xreset.retarget import verbs
-from xreset.robot_tools.draft import hand_side
 
 if TYPE_CHECKING:
     from xreset.retarget.file import Retargeted
 
 
 def _show(motion: Retargeted, options: Mapping[str, Any]) -> None:
+    from xreset.robot_tools.draft import hand_side  # imports torch
+
     side = hand_side(load_robot(options["robot"]))
     others = np.count_nonzero(motion.hand_side != side)
     if side and others:

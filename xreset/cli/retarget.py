@@ -10,7 +10,6 @@ import numpy as np
 from xreset.cli._common import show_accounts
 from xreset.cli._terminal import console, show_notes
 from xreset.cli._verbs import REQUIRED, verb
-from xreset.geometry.description import load_robot
 from xreset.retarget import verbs
 
 if TYPE_CHECKING:
@@ -18,7 +17,9 @@ if TYPE_CHECKING:
 
 
 def _show(motion: Retargeted, options: Mapping[str, Any]) -> None:
-    from xreset.robot_tools.draft import hand_side  # imports torch
+    # not for the help: these import torch and scipy
+    from xreset.geometry.description import load_robot
+    from xreset.robot_tools.draft import hand_side
 
     side = hand_side(load_robot(options["robot"]))
     others = np.count_nonzero(motion.hand_side != side)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from xreset.files.checks import Options, PositiveInt, Seed, frozen
+from xreset.files.checks import Options, Seed, frozen
 from xreset.physics.plugins import Device
 
 
@@ -20,11 +20,3 @@ class Place(Options):
     """Seed of everything that is drawn; draws are the same in every engine."""
     device: Device = "cpu"
     """Where GPU engines run: cpu or cuda."""
-
-
-@frozen
-class Setting(Place):
-    """Robot, meshes, seed, device and worlds."""
-
-    num_envs: PositiveInt = 64
-    """Worlds that run at the same time."""

@@ -56,6 +56,8 @@ class Attribution:
     a: EvalResult
     """In A, also with properties of B."""
     b: EvalResult
+    folder: Path | None = None
+    """Folder of the files."""
 
     @cached_property
     def rows(self) -> tuple[Row, ...]:
@@ -160,7 +162,7 @@ def attribute(
                     finite[COMPARED[name].option] = value
             results.append(replace(result, measured=finite, left_out=left_out))
             write_result(out, results[-1], traces, trial.robot.joint_names)
-    return Attribution(a=results[0], b=results[1])
+    return Attribution(a=results[0], b=results[1], folder=out)
 
 
 def change_towards(

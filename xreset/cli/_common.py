@@ -39,13 +39,6 @@ Flat = Annotated[_T, arg(name="")]
 
 # Options that several commands share, with their help -----------------------------------------------------------------
 
-_POLICY = (
-    "Run folder, one of its checkpoints (.pt), exported policy (.onnx), or name of a policy that ships with xreset "
-    "(xreset policies)"
-)
-PolicyOrBaseline = Annotated[
-    Name, arg(help=f"{_POLICY}; or a baseline: zero, random, ik (open-loop kinematic retargeting).")
-]
 RobotName = Annotated[Name, arg(help="Name of a robot, or a folder with a robot.toml.")]
 Robot = Annotated[
     str | None, arg(help="Name or folder of the robot; default: the policy's, or the file's.")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -15,7 +16,6 @@ from xreset.cli._common import (
     Device,
     Flat,
     Meshes,
-    PolicyOrBaseline,
     Robot,
     Several,
     Source,
@@ -26,8 +26,9 @@ from xreset.cli._common import (
 )
 from xreset.cli._options import Output
 from xreset.cli._terminal import Progress, console, show_table
-from xreset.errors import XResetError
-from xreset.eval.setting import Place, Setting
+from xreset.cli._verbs import verb
+from xreset.eval import verbs
+from xreset.eval.setting import Place
 from xreset.files.checks import NonNegativeInt, PositiveInt
 from xreset.files.storage import file_hash, write_json, write_whole
 from xreset.physics.plugins import backend_class, backend_names, backend_status, make_backend
@@ -36,6 +37,7 @@ from xreset.spec import SceneSpec
 if TYPE_CHECKING:
     from xreset.backends import conformance
     from xreset.eval.engines import agreement
+    from xreset.eval.engines.attribution import Attribution
 
 
 def list_() -> None:
@@ -290,58 +292,20 @@ def trace(
     console.print(f"results in {out}")
 
 
-def attribute(
-    policy: PolicyOrBaseline,
-    *,
-    demos: Path,
-    towards: str,
-    engine: str = "mujoco",
-    only: Several = (),
-    episodes: PositiveInt = 1,
-    setting: Flat[Setting] = Setting(),
-    out: Output | None = None,
-) -> None:
-    """Find the physical difference between two engines that costs a policy its skill.
-
-    First both engines are measured through their interface: friction, drive stiffness and damping, timestep. Then the
-    policy plays the same episodes in one engine, in that engine with one property changed to the value of the other
-    engine, with all properties changed, and in the other engine.
-
-    Args:
-        demos: Demonstrations (xreset demos) or retargeted trajectories (xreset retarget): starts and goals, and the
-            path of ik. `xreset demos select` makes a file of some objects.
-        towards: Engine towards which the properties are changed, usually the one in which the policy does worse.
-        engine: Engine in which the properties are changed.
-        only: Property to change; give it again for more. Default: all in which the engines differ.
-        episodes: Episodes of each demonstration.
-        setting: Robot, meshes, seed of the perturbations of the starts, device and worlds.
-        out: Folder for the results, one file for each engine; default: attribute/ next to the policy's results.
-    """
-    from xreset.eval import policy_spec, rollout
+def _show_attribution(found: Attribution, options: Mapping[str, Any]) -> None:
     from xreset.eval.engines import attribution
 
-    if engine == towards:
-        raise XResetError(f"--engine and --towards are both {engine!r}. Choose two engines.")
-    spec = policy_spec.load_policy(policy, robot=setting.robot, seed=setting.seed)
-    a, b = (rollout.engine(name, device=setting.device) for name in (engine, towards))
-    played = rollout.load_trial(
-        spec, demos, meshes=setting.meshes, seed=setting.seed, num_envs=setting.num_envs
-    )
-    out = out or spec.folder.parent / "attribute"
-    with Progress() as bar:
-        found = attribution.attribute(
-            spec, a, b, played, out, episodes=episodes, only=only, progress=bar.stages()
-        )
-    demonstrations = len(played.bank.sequence_name)
+    first = found.a
     counts = (
-        f"episodes: {len(found.a.nominal)}, demonstrations: {demonstrations}, seed: {setting.seed}"
+        f"episodes: {len(first.nominal)}, demonstrations: {first.nominal['sequence'].nunique()}, "
+        f"seed: {first.seed}"
     )
-    title = f"{spec.name} on {spec.robot.name}: what costs the skill between {engine} and {towards}\n{counts}"
-    console.print(attribution.rich_table(found, title))
+    title = f"{first.policy} on {first.robot}: what costs the skill between {first.engine} and {found.b.engine}"
+    console.print(attribution.rich_table(found, f"{title}\n{counts}"))
     for line in attribution.not_tried(found):
         console.print(line, style="dim")
     console.print(attribution.verdict(found))
-    console.print(f"results in {out}")
+    console.print(f"results in {found.folder}")
 
 
 COMMAND = {
@@ -349,5 +313,5 @@ COMMAND = {
     "check": check,
     "compare": compare,
     "trace": trace,
-    "attribute": attribute,
+    "attribute": verb(verbs.attribute, _show_attribution),
 }

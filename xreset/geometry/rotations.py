@@ -115,11 +115,3 @@ def homogeneous(R: Tensor, pos: Tensor) -> Tensor:
 def matvec(matrix: Tensor, vector: Tensor) -> Tensor:
     """[..., n] product of matrices [..., n, m] and vectors [..., m]; both broadcast."""
     return (matrix @ vector[..., None])[..., 0]
-
-
-def turned(R: Tensor, vector: Tensor) -> Tensor:
-    """[..., 3] vectors turned by rotation matrices [..., 3, 3]; both broadcast.
-
-    For many small matrices this is faster than :func:`matvec`, which makes a call for each.
-    """
-    return (R * vector[..., None, :]).sum(-1)

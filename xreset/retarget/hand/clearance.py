@@ -16,7 +16,7 @@ from xreset.files.checks import frozen
 from xreset.geometry.balls import STAND_IN, members
 from xreset.geometry.collision import height_above_table
 from xreset.geometry.fields import DistanceFields
-from xreset.geometry.rotations import matvec, turned
+from xreset.geometry.rotations import matvec
 from xreset.physics.tensors import Tensors
 from xreset.retarget.hand.model import Bodies, HandModel
 
@@ -48,7 +48,7 @@ class Objects(NamedTuple):
 
     def local(self, points: Tensor, frame: Tensor) -> Tensor:
         """[..., 3] points in the mesh frame of the object of their frame [...]."""
-        return turned(self.rot[frame].mT, points - self.pos[frame])
+        return matvec(self.rot[frame].mT, points - self.pos[frame])
 
     def signed_distance(self, points: Tensor, frame: Tensor) -> tuple[Tensor, Tensor]:
         """See :meth:`DistanceFields.signed_distance`; points [N, 3] of frames [N] and gradients [N, 3] in the world."""
@@ -128,7 +128,7 @@ def _below_table(model: HandModel, bodies: Bodies, considered: Tensor) -> Distan
     """Return the heights of balls that are below the table's top."""
     balls = model.balls
     rot = bodies.rot[:, model.group_body]
-    middle = (bodies.pos[:, model.group_body] + turned(rot, balls.middles))[..., 2]
+    middle = (bodies.pos[:, model.group_body] + matvec(rot, balls.middles))[..., 2]
     reach = (rot[:, :, 2].abs() * balls.half_sizes).sum(-1)
     frame, link = (considered[:, None] & (middle < reach)).nonzero(as_tuple=True)
     owner, ball = members(balls.first[link], balls.count[link])
@@ -153,18 +153,20 @@ def _at_object(
     body = model.group_body[link]
     inverse = objects.rot[frame].mT
     turn = inverse @ bodies.rot[frame, body]
-    shift = turned(inverse, bodies.pos[frame, body] - objects.pos[frame])
+    shift = matvec(inverse, bodies.pos[frame, body] - objects.pos[frame])
     meet = _boxes_meet(model, turn, shift, link, fields, objects.object_index[frame], clearance)
     frame = frame[meet]
     owner, ball = members(balls.first[link[meet]], balls.count[link[meet]])
-    local = turned(turn[meet][owner], balls.centers[ball]) + shift[meet][owner]
+    local = matvec(turn[meet].index_select(0, owner), balls.centers[ball]) + shift[
+        meet
+    ].index_select(0, owner)
     frame = frame[owner]
     near, distance, away = fields.nearer(
         local, objects.object_index[frame], balls.radii[ball] + clearance
     )
     frame = frame[near]
     ball = ball[near]
-    direction = turned(objects.rot[frame], away)
+    direction = matvec(objects.rot[frame], away)
     centers = model.ball_centers(bodies, frame, ball)
     return Distances(
         frame=frame,
@@ -181,7 +183,7 @@ def _in_each_other(
     balls = model.balls
     margin = STAND_IN - self_depth
     a, b = balls.link_pairs.unbind(1)
-    middles = bodies.pos[:, model.group_body] + turned(
+    middles = bodies.pos[:, model.group_body] + matvec(
         bodies.rot[:, model.group_body], balls.middles
     )
     reach = balls.half_sizes.norm(dim=-1)
@@ -193,20 +195,22 @@ def _in_each_other(
     second = model.group_body[b]
     inverse = bodies.rot[frame, second[pair]].mT
     turn = inverse @ bodies.rot[frame, first[pair]]
-    shift = turned(inverse, bodies.pos[frame, first[pair]] - bodies.pos[frame, second[pair]])
+    shift = matvec(inverse, bodies.pos[frame, first[pair]] - bodies.pos[frame, second[pair]])
     meet = _boxes_meet(model, turn, shift, a[pair], balls.fields, b[pair], margin)
     frame = frame[meet]
     pair = pair[meet]
     owner, guard = members(balls.first_guard[a[pair]], balls.guard_count[a[pair]])
     ball = balls.guards[guard]
-    local = turned(turn[meet][owner], balls.centers[ball]) + shift[meet][owner]
+    local = matvec(turn[meet].index_select(0, owner), balls.centers[ball]) + shift[
+        meet
+    ].index_select(0, owner)
     near, distance, away = balls.fields.nearer(
         local, b[pair[owner]], balls.guard_radii[guard] - self_depth
     )
     frame = frame[owner[near]]
     pair = pair[owner[near]]
     guard = guard[near]
-    direction = turned(bodies.rot[frame, second[pair]], away)
+    direction = matvec(bodies.rot[frame, second[pair]], away)
     centers = model.ball_centers(bodies, frame, ball[near])
     return Distances(
         frame=frame,
@@ -242,10 +246,10 @@ def _boxes_meet(
     low = fields.low[index]
     high = fields.high[index]
     field_half = (high - low) / 2
-    between = turned(turn, model.balls.middles[link]) + shift - (low + high) / 2
+    between = matvec(turn, model.balls.middles[link]) + shift - (low + high) / 2
     extent = turn.abs()
-    in_field = (between.abs() <= field_half + turned(extent, half)).all(-1)
-    in_link = (turned(turn.mT, between).abs() <= half + turned(extent.mT, field_half)).all(-1)
+    in_field = (between.abs() <= field_half + matvec(extent, half)).all(-1)
+    in_link = (matvec(turn.mT, between).abs() <= half + matvec(extent.mT, field_half)).all(-1)
     return in_field & in_link
 
 

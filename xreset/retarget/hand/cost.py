@@ -133,7 +133,9 @@ def _keypoint_terms(
     contact = terms.contact(x, touched, in_contact, margin, config.contact_knee / scale)
     on_points = terms.difference(x, human, alignment) + contact
 
-    moves = torch.cat((J[:, b] - J[:, a], J), dim=1)  # [B, C + P, 3, m]
+    # index_select copies large rows twice as fast as an index
+    of_bones = J.index_select(1, b).sub_(J.index_select(1, a))
+    moves = torch.cat((of_bones, J), dim=1)  # [B, C + P, 3, m]
     curvature = torch.cat((on_bones.curvature, on_points.curvature), dim=1)
     slope = torch.cat((on_bones.gradient, on_points.gradient), dim=1)
     rows = moves.flatten(1, 2)

@@ -21,7 +21,7 @@ from xreset.geometry.balls import hand_balls
 from xreset.geometry.collision import SelfCollision
 from xreset.geometry.fields import DistanceFields
 from xreset.geometry.kinematics import Kinematics
-from xreset.geometry.rotations import homogeneous, matvec, quat_to_matrix, turned
+from xreset.geometry.rotations import homogeneous, matvec, quat_to_matrix
 from xreset.physics.tensors import Tensors
 from xreset.spec import FINGERS, KEYPOINTS, RobotSpec, TableSpec
 
@@ -197,7 +197,7 @@ class HandModel:
     def ball_centers(self, bodies: Bodies, frame: Tensor, ball: Tensor) -> Tensor:
         """[A, 3] centers in the world of balls [A] in frames [A]."""
         body = self.group_body[self.balls.link[ball]]
-        return bodies.pos[frame, body] + turned(bodies.rot[frame, body], self.balls.centers[ball])
+        return bodies.pos[frame, body] + matvec(bodies.rot[frame, body], self.balls.centers[ball])
 
 
 @frozen

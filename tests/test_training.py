@@ -11,7 +11,7 @@ import subprocess
 import sys
 import threading
 import time
-from contextlib import contextmanager, redirect_stderr, suppress
+from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
 from dataclasses import asdict, replace
 from pathlib import Path
 from unittest import SkipTest
@@ -490,8 +490,12 @@ class TrainingTest(WithBank):
                 self.assert_resumed(f"train --resume --out {self.out} {options}", problem)
 
     def test_a_number_of_iterations_that_has_passed_does_not_shorten_a_run(self):
+        """The policy is exported where that is missing."""
         out = self.train("long")
-        self.assertIn("is trained", self.resume(out, iterations=1))
+        with redirect_stdout(io.StringIO()) as said:
+            resume(out, iterations=1)
+        self.assertIn("is trained", said.getvalue())
+        self.assertEqual(read_policy(out).content, (out / "policy.onnx").read_bytes())
         self.assertEqual(read_run(out).config, CONFIG)
 
     def test_a_schedule_without_effect_is_refused(self):

@@ -3,7 +3,7 @@
 import io
 from contextlib import contextmanager, redirect_stdout
 from functools import partial
-from unittest.mock import patch
+from unittest.mock import Mock, patch
 
 import numpy as np
 
@@ -50,6 +50,8 @@ def quickly():
     in_this_process = patch(
         "xreset.env.manipulation.make_backend", partial(make_backend, workers=0)
     )
-    without_export = patch("xreset.learning.train.export_checkpoint")
+    without_export = patch.multiple(
+        "xreset.learning.train", export_checkpoint=Mock(), _export_if_missing=Mock()
+    )
     with in_this_process, without_export, redirect_stdout(io.StringIO()) as said:
         yield said

@@ -679,6 +679,9 @@ class Toy(Robots):
             made = import_robot(None, self.file(f"{name}.urdf", urdf), self.folder / name)
             spec = load_robot(made.folder)
             self.assertEqual(len(spec.arm_indices), 7)
+            at_start = spec.home[spec.hand_indices]
+            ends = Kinematics(spec).upper.numpy()[spec.hand_indices]
+            assert_allclose(at_start, 0.85 * ends, atol=1e-3, err_msg="the jaw is open at home")
             palms = []
             for robot in (spec, described):
                 hand, palm = at_home(robot, described.hand_root, robot.palm)

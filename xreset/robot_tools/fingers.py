@@ -414,8 +414,10 @@ class Hand:
         if is_jaw:
             # as in a right hand, whose thumb is against the palm's y
             apart = ends[1] - ends[0]
-            if np.linalg.norm(apart) < 0.01:  # the jaw is closed where its joint is at 0
-                apart = self._opened(fingers)
+            opened = self._opened(fingers)
+            if np.linalg.norm(opened) > np.linalg.norm(apart):  # closed where its joints are at 0
+                apart = opened
+                self.bent = {name: bend * (1 / _BEND - 1) for name, bend in self.bent.items()}
             z = np.cross(x, apart)
         if not self.bent and not is_jaw:
             raise RobotError(

@@ -396,7 +396,7 @@ class MeshImport(InFolder):
         self.assertIn("There is no no.stl.", refused("objects", "import", "no.stl"))
         self.assertRegex(
             succeeds(*command, "--out", out, "--name", "brick", "--png", png),
-            r"brick\W+0.200\W+100x60x40\W+1 hull",
+            r"brick\W+0.2\W+100x60x40\W+1 hull",
         )
         self.assertTrue(png.read_bytes().startswith(b"\x89PNG"))
         self.assertIn("brick", succeeds("objects", "import", out))

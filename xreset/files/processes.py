@@ -8,6 +8,9 @@ from typing import TypeVar, cast
 
 from xreset.errors import XResetError
 
+_IDLE = 10.0
+"""[s] after which a process without work ends: five minutes by default, for which a child of multiprocessing would wait
+at its own end."""
 _Job = TypeVar("_Job")
 _Result = TypeVar("_Result")
 
@@ -31,7 +34,7 @@ def in_processes(function: Callable[[_Job], _Result], jobs: Sequence[_Job]) -> I
     if count <= 1:
         yield from map(function, jobs)
         return
-    with joblib.parallel_config(backend="loky", inner_max_num_threads=1):
+    with joblib.parallel_config(backend="loky", inner_max_num_threads=1, idle_worker_timeout=_IDLE):
         pool = joblib.Parallel(n_jobs=count, return_as="generator")
         results = pool(joblib.delayed(function)(job) for job in jobs)
         try:

@@ -77,7 +77,7 @@ def expected(training: Training) -> list[str]:
     lift = training.lift
     if lift.iteration and not lift.passed:
         found.append(
-            f"0 % is expected here: in {lift.iteration:,} iterations ({lift.minutes:.2g} minutes), the training has not"
+            f"0 % is expected here: in {lift.iteration:,} iterations ({lift.minutes:.2g} min), the training has not"
             " once brought an object to its goal from home. Most trainings need minutes on a GPU for that."
         )
     return found

@@ -150,7 +150,7 @@ class CollectTest(Reported):
                 self.assertEqual(len(notes), int(expected))
                 if expected:
                     self.assertRegex(
-                        notes[0], r"^0 % is expected here: in 10 iterations \(0.6 minutes\)"
+                        notes[0], r"^0 % is expected here: in 10 iterations \(0.6 min\)"
                     )
 
     def test_a_policy_that_sees_needs_no_run(self):

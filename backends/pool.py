@@ -145,6 +145,11 @@ class World(ABC):
         """Free what the engine holds."""
 
 
+def lacks_weight(world: type[World]) -> bool:
+    """Return whether the engine's own gravity does not pull the object, so that its weight is added to the force."""
+    return world.set_object_gravity is World.set_object_gravity
+
+
 def is_finite(state: StateArrays) -> bool:
     """Return whether all numbers of a state are finite.
 
@@ -216,7 +221,7 @@ class PoolBackend(Backend):
             job = Job(
                 backend=self.name,
                 world_class=self.world_class,
-                adds_weight=self.world_class.set_object_gravity is World.set_object_gravity,
+                adds_weight=lacks_weight(self.world_class),
                 options=world_options,
                 scene=scene,
                 worlds=worlds,

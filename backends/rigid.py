@@ -11,6 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from itertools import combinations
+from typing import cast
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -409,9 +410,13 @@ OTHER_LINK = -2
 """What touches the object: these, or the index of a fingertip."""
 
 
-def sum_contacts(tips: int, contacts: Iterable[tuple[int, np.ndarray]]) -> ContactArrays:
+def sum_contacts(
+    tips: int, contacts: Iterable[tuple[int, np.ndarray]] | ContactArrays
+) -> ContactArrays:
     """Return tip force [E, 3], tip touch [E] and table force [3], given what touches the object and with which
-    force [3]. A contact without force is no touch."""
+    force [3], or the sums themselves. A contact without force is no touch."""
+    if isinstance(contacts, tuple):
+        return cast("ContactArrays", contacts)
     tip_force = np.zeros((tips, 3))
     tip_touch = np.zeros(tips, dtype=bool)
     table_force = np.zeros(3)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from xreset.backends.pool import PoolBackend, World
+from xreset.backends.pool import PoolBackend, World, lacks_weight
 from xreset.backends.rigid import ContactArrays, StateArrays, sum_contacts
 from xreset.physics import Backend
 from xreset.physics.plugins import backend_class
@@ -47,8 +47,7 @@ class SingleWorld:
             self._world: World = cls.world_class(scene, 0)
         else:
             self._world = _BatchWorld(cls(scene, 1))
-        own = type(self._world)
-        self._adds_weight = own.set_object_gravity is World.set_object_gravity
+        self._adds_weight = lacks_weight(type(self._world))
         self.set_state(state)
 
     def set_state(self, state: State) -> None:
@@ -82,10 +81,8 @@ class SingleWorld:
         self._world.set_object_wrench(np.asarray(force, float), np.asarray(torque, float))
         self._world.step(substeps)
         self._read()
-        contacts = self._world.contacts()
-        if not isinstance(contacts, tuple):
-            contacts = sum_contacts(self._tips, contacts)
-        self.tip_force = np.array(contacts[0], float)
+        tip_force, *_ = sum_contacts(self._tips, self._world.contacts())
+        self.tip_force = np.array(tip_force, float)
 
     def _read(self) -> None:
         state = self._world.get_state()

@@ -244,9 +244,7 @@ class LocalWorlds:
         for name, value in zip(("nonfinite", "overflow"), health, strict=True):
             arrays[name][i] |= value
         if stepped:
-            contacts = world.contacts()
-            if not isinstance(contacts, tuple):
-                contacts = sum_contacts(self._tips, contacts)
+            contacts = sum_contacts(self._tips, world.contacts())
             self._take(i, "contacts", CONTACT_FIELDS, contacts)
         else:
             for name in CONTACT_FIELDS:

@@ -57,7 +57,7 @@ _BETTER_TURN = 0.72
 _BETTER_INVERSE = 0.5
 """The same of inverse orientations: 0.53."""
 _TOGETHER = 0.7
-"""Largest slip in another unit that tells the unit of an object which hardly moves."""
+"""Largest slip in another unit with which that unit is believed, where the object hardly moves."""
 _STANDS = 0.92
 """The same if it also makes an object stand that would fall over."""
 _KNOWN = 0.35
@@ -124,6 +124,11 @@ class Recording:
     def moved(self) -> np.ndarray:
         """[F] bool: whether the object has moved from its start."""
         return np.linalg.norm(self.pos - self.pos[0], axis=1) > MOVED
+
+    @cached_property
+    def step_turn(self) -> Rotation:
+        """F-1 turns of the object from one frame to the next."""
+        return self.turn[1:] * self.turn[:-1].inv()
 
     @cached_property
     def start_height(self) -> float:

@@ -485,7 +485,7 @@ def _of_motion(r: Recording) -> Iterator[Finding]:
     if len(r.pos) < 3:
         return
     speed = r.fps * np.linalg.norm(np.diff(r.pos, axis=0), axis=1)
-    angle = (r.turn[1:] * r.turn[:-1].inv()).magnitude()
+    angle = r.step_turn.magnitude()
     across = (r.turn[2:] * r.turn[:-2].inv()).magnitude()
     turned = np.minimum(angle[1:], angle[:-1]) - across > _TURN_RETURN
     jumps = np.zeros(len(r.pos), dtype=bool)
@@ -537,7 +537,7 @@ def _lost_frame(r: Recording) -> int:
     change at all for a while; 0 if there is none."""
     quats = r.turn.as_quat()
     step = np.linalg.norm(np.diff(r.pos, axis=0), axis=1)
-    angle = (r.turn[1:] * r.turn[:-1].inv()).magnitude()
+    angle = r.step_turn.magnitude()
     for same, jumps in (
         (step == 0.0, step > _GOES_ON),
         ((quats[1:] == quats[:-1]).all(axis=1), angle > _TURNS_ON),
@@ -562,8 +562,7 @@ def _doubts_of_tracking(r: Recording) -> Iterator[Finding]:
         )
         return
     place = np.linalg.norm(np.diff(r.pos, n=2, axis=0), axis=1) / np.sqrt(6.0)
-    turn = (r.turn[1:] * r.turn[:-1].inv()).as_rotvec()
-    angle = np.linalg.norm(np.diff(turn, axis=0), axis=1) / np.sqrt(6.0)
+    angle = np.linalg.norm(np.diff(r.step_turn.as_rotvec(), axis=0), axis=1) / np.sqrt(6.0)
     trembles = []
     dt = 1.0 / r.fps
     for values, most, text in (

@@ -6,6 +6,8 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from typing import TypeVar, cast
 
+import numpy as np
+
 from xreset.errors import XResetError
 
 _IDLE = 10.0
@@ -13,6 +15,18 @@ _IDLE = 10.0
 at its own end."""
 _Job = TypeVar("_Job")
 _Result = TypeVar("_Result")
+
+
+def batches(jobs: np.ndarray, *, small: int, most: int) -> list[np.ndarray]:
+    """Split jobs into batches of about equal length, whatever the machine: an even number of them, for two cores.
+
+    Args:
+        jobs: [N, ...]
+        small: number of jobs up to which one batch takes less time than a second process takes to start.
+        most: most jobs of a batch.
+    """
+    count = 2 * -(-len(jobs) // (2 * most)) if len(jobs) > small else 1
+    return np.array_split(jobs, count)
 
 
 def in_processes(function: Callable[[_Job], _Result], jobs: Sequence[_Job]) -> Iterator[_Result]:

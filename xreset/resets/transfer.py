@@ -20,6 +20,7 @@ from torch import Tensor
 
 from xreset.errors import DemoError
 from xreset.files.checks import PositiveInt, frozen, obeys_rules
+from xreset.files.processes import batches
 from xreset.files.progress import unseen
 from xreset.geometry.rotations import matrix_to_quat, quat_angle
 from xreset.geometry.shapes import turn_of
@@ -57,7 +58,7 @@ _SEED = 0
 _BATCH = 512
 """Candidates whose inverse kinematics is solved at a time, at most; limits the memory that this takes."""
 _SMALL_BATCH = 64
-"""So few candidates take less time in one batch than a second process takes to start."""
+"""Candidates up to which one batch takes less time than a second process takes to start."""
 
 
 @frozen
@@ -285,18 +286,16 @@ def _carried(
     root_turn = turn * Rotation.from_matrix(root[:, :3, :3])
     root_quat = matrix_to_quat(torch.as_tensor(root_turn.as_matrix()))
     hand_joints = torch.as_tensor(joint_pos[:, model.hand.joint_indices])
-    # an even number of batches, for two cores
-    number = 2 * -(-len(grasp) // (2 * _BATCH)) if len(grasp) > _SMALL_BATCH else 1
-    batches = np.array_split(np.arange(len(grasp)), number)
+    parts = batches(np.arange(len(grasp)), small=_SMALL_BATCH, most=_BATCH)
     paths = [
         ArmTargets.of_poses(
             torch.as_tensor(root_pos[rows]), root_quat[rows], hand_joints[rows, None]
         )
-        for rows in batches
+        for rows in parts
     ]
     solved = track_each(robot, paths, _THRESHOLDS, QUICK)
     is_reached = np.zeros(len(grasp), dtype=bool)
-    for rows, (arm, measures) in zip(batches, solved, strict=True):
+    for rows, (arm, measures) in zip(parts, solved, strict=True):
         joint_pos[rows[:, None], robot.arm_indices] = arm[:, 0].numpy()
         is_reached[rows] = (classify(measures, _THRESHOLDS) == 0)[:, 0].numpy()
         progress(int(rows[-1]) + 1)

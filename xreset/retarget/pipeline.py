@@ -16,7 +16,7 @@ from torch import Tensor
 from xreset.demos.archive import Demos, rest_on_table
 from xreset.demos.examine import human_contacts
 from xreset.files.checks import Checked, frozen
-from xreset.files.processes import in_processes
+from xreset.files.processes import batches, in_processes
 from xreset.files.progress import Progress, unseen
 from xreset.geometry.fields import DistanceFields
 from xreset.geometry.rotations import matrix_to_quat, quat_to_matrix
@@ -36,7 +36,7 @@ from xreset.spec import ObjectSpec, RobotSpec, objects_named
 _SEQUENCES_PER_BATCH = 45
 """At most: enough to use the processor well; few enough to keep memory below about 1 GB and to show progress."""
 _SMALL_BATCH = 10
-"""So few sequences take less time in one batch than a second process takes to start."""
+"""Sequences up to which one batch takes less time than a second process takes to start."""
 _FRAMES_AT_ONCE = 512
 """Frames whose measures are taken at a time; limits the memory that this takes."""
 _THRESHOLDS = Thresholds()
@@ -186,11 +186,7 @@ class HandMotions:
         robot = self.model.robot
         parts = []
         jobs = []
-        count = 1
-        if len(todo) > _SMALL_BATCH:
-            # an even number, for two cores
-            count = 2 * -(-len(todo) // (2 * _SEQUENCES_PER_BATCH))
-        for sequences in np.array_split(todo, count):
+        for sequences in batches(todo, small=_SMALL_BATCH, most=_SEQUENCES_PER_BATCH):
             rows = np.flatnonzero(np.isin(owner, sequences))
             is_frame = np.arange(lengths[sequences].max()) < lengths[sequences, None]
             targets = self._targets(sequences, rows, is_frame)

@@ -97,11 +97,11 @@ def check(name_or_folder: str | Path) -> list[Finding]:
     kinematics = Kinematics(spec)
     q = _around_home(kinematics)
     found += _topic("drives", _drives(spec), "damping ratios at home are between 0.5 and 5")
-    whose = f"the {hand_side(spec)} palm" if hand_side(spec) else "the palm"
+    palm = f"{hand_side(spec)} palm".strip()
     found += _topic(
         "frames",
         _frames(spec, tree),
-        f"the palm frame is in {whose}, and looks along the fingers",
+        f"the palm frame is in the {palm}, and looks along the fingers",
     )
     found += _topic(
         "fingers", _fingers(spec, tree), "no fingertip opposes the others more than the thumb"

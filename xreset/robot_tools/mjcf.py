@@ -48,7 +48,7 @@ mujoco.mj_saveModel(model, target)
 """
 """Program that compiles a model in a process whose memory and time are limited: small files can ask for any amount."""
 _RADIANS_AS_DEGREES = np.radians(2 * np.pi)
-"""No hinge of a file that means radians, and leaves it to another file to say so, turns farther [rad]."""
+"""Largest limit that a hinge can have if its radians were read as degrees [rad]: a full turn."""
 _LARGEST = 1e10
 """Larger numbers are errors."""
 _PARTS = ("actuator_", "body_", "dof_", "eq_", "geom_", "jnt_", "qpos", "tendon_", "wrap_")

@@ -72,11 +72,11 @@ def train(
         seed: seed of every random number; default: 0.
         resume: continue the run in the folder as it was started: its other options need not be given. Name reward terms
             of your own again.
-        recipe: where the configuration starts from: a recipe (default, robust, minutes, live, paper, published), a TOML
-            file of your own with the tables that it changes (docs/clusters.md), or another run's folder. Options
-            --config.* change it; see them with xreset train --help-config [PART]. Reward terms of your own are not
-            taken from a file or a run; name them again. Default: the recipe of the headline results; with weights and
-            goals, the run of the weights.
+        recipe: where the configuration starts from: a recipe (default, robust, minutes, any_object, live, paper,
+            published), a TOML file of your own with the tables that it changes (docs/clusters.md), or another run's
+            folder. Options --config.* change it; see them with xreset train --help-config [PART]. Reward terms of your
+            own are not taken from a file or a run; name them again. Default: the recipe of the headline results; with
+            weights and goals, the run of the weights.
         weights: another run's folder: start with the networks of its newest checkpoint, including the standard
             deviation of the actions and the learning rate.
         teacher: run folder, exported policy (.onnx), or name of a policy that ships with xreset: a student learns its

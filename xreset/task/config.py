@@ -420,8 +420,8 @@ class TaskConfig(Checked):
     object_frame: Literal["mesh", "center"] = "mesh"
     """Origin of the object in observations, rewards, ends of episodes, perturbed starts and goals, and the draft's
     metrics. ``mesh``: the origin of the mesh file (the paper). ``center``: the center of volume of the convex hull,
-    which does not depend on the file's origin and axes. With the observations of the recipe ``live`` the file's axes
-    have no effect either."""
+    which does not depend on the file's origin and axes. With the observations of the recipe ``any_object`` the
+    file's axes have no effect either."""
     distance_points: PositiveInt = 256
     """Surface points per object for fingertip distances."""
 

@@ -15,8 +15,14 @@ from xreset.geometry.description import load_robot
 from xreset.learning.exported import PolicyFile, find_policy
 from xreset.live.deploy import deployed_graph, is_deployed, made_for, training_of
 from xreset.objects.catalogue import object_names
-from xreset.policy.onnx_policy import OnnxPolicy, Policy, check_contract, check_robot_of
-from xreset.policy.shipped import graph_of
+from xreset.policy.onnx_policy import (
+    OnnxPolicy,
+    Policy,
+    check_contract,
+    check_robot_of,
+    of_another_robot,
+)
+from xreset.policy.shipped import graph_of, no_policy_for, shipped_name
 from xreset.resets.bank import ResetBank
 from xreset.retarget.file import Retargeted
 from xreset.runtime import Controller
@@ -29,6 +35,8 @@ if TYPE_CHECKING:  # functions import torch, which playing a deployed policy doe
 
 BASELINES = ("zero", "random", "ik")
 """Names of the policies that need no training."""
+DEFAULT = "many-objects"
+"""Policy that is played where neither a policy nor a robot is named."""
 
 
 @frozen
@@ -160,6 +168,24 @@ class PolicySpec(Brief, Checked):
         return deployed_graph(content, self.robot, self.task)
 
 
+def default_policy(robot: str | Path | None) -> str:
+    """Return the name of the policy that ships for a robot; without a robot :data:`DEFAULT`.
+
+    Args:
+        robot: name or folder.
+
+    Raises:
+        PolicyError: no policy ships for the robot.
+    """
+    if robot is None:
+        return DEFAULT
+    spec = load_robot(robot)
+    name = shipped_name(spec.name)
+    if name is None:
+        raise PolicyError(no_policy_for(spec.name))
+    return name
+
+
 def load_policy(
     policy: str | Path | PolicySpec, *, robot: str | Path | None = None, seed: Seed = 0
 ) -> PolicySpec:
@@ -167,8 +193,8 @@ def load_policy(
 
     Args:
         policy: run folder, one of its checkpoints (.pt), exported or deployed policy (.onnx), folder of a deployed one
-            (``docs/live.md``), name of a policy that ships with xreset, or one of :data:`BASELINES`. A loaded policy is
-            returned as it is; ``robot`` must be its own then.
+            (``docs/live.md``), name of a policy that ships with xreset, name of a robot for which one ships, or one of
+            :data:`BASELINES`. A loaded policy is returned as it is; ``robot`` must be its own then.
         robot: name or folder of the robot; default: the policy's own. Baselines need it.
         seed: seed of the baseline ``random``.
 
@@ -196,6 +222,8 @@ def load_policy(
     spec = load_robot(robot or (run.robot if run else contract.robot))
     if not is_graph:
         check_robot_of(str(found.path), contract, spec)
+    elif contract.joint_names != spec.joint_names and contract.robot != spec.name:
+        raise of_another_robot(str(found.path), contract.robot, spec.name)
     elif contract.joint_names != spec.joint_names:
         raise PolicyError(
             f"{found.path} has the joints {', '.join(contract.joint_names)}, but the robot {spec.name!r} has "

@@ -433,7 +433,7 @@ def export_episodes(
 
 @obeys_rules
 def play(
-    policy: str | Path | PolicySpec = "many-objects",
+    policy: str | Path | PolicySpec | None = None,
     *,
     object_name: Annotated[str | None, Option("object")] = None,
     engine: str = "mujoco",
@@ -448,7 +448,7 @@ def play(
 
     Args:
         policy: run folder, one of its checkpoints (.pt), exported policy (.onnx), or name of a policy that ships with
-            xreset (xreset policies).
+            xreset (xreset policies); default: the one that ships for the robot, without a robot many-objects.
         object_name: object to begin with; default: the soup can, or else the first one.
         engine: physics engine to begin with.
         robot: name or folder of the robot; default: the policy's own.

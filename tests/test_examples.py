@@ -172,7 +172,7 @@ class FromABankTest(InOneFolder):
             for arguments, message in (
                 (
                     ("soup-can", env, "film.mp4"),
-                    "trained with another robot .robot: 'ur7e-sharpa', here 'openarm'",
+                    "soup-can is a policy of the robot 'ur7e-sharpa', not of 'openarm'",
                 ),
                 (("no-such-policy", env, "film.mp4"), "no-such-policy"),
                 (

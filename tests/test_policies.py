@@ -3,6 +3,7 @@
 import contextlib
 import json
 import os
+import shutil
 import tempfile
 from dataclasses import asdict
 from hashlib import sha256
@@ -19,6 +20,8 @@ from tests.toy_bank import SOUP
 from tests.toy_policy import write_policy
 from xreset import load_policy, robots, synthesize, write_demos
 from xreset.errors import PolicyError
+from xreset.eval.policy_spec import default_policy
+from xreset.physics.plugins import robot_folder
 from xreset.policy import shipped
 from xreset.policy.onnx_policy import OnnxPolicy, observation_shapes, policy_contract
 from xreset.task.config import ObservationConfig, TaskConfig, TerminationConfig
@@ -123,6 +126,18 @@ class OnnxPolicyTest(WithPolicy):
         self.assertIn(f"{run} is not a run folder", " ".join(told.split()))
 
 
+CARD = """schema = "xreset-policy-card/1"
+about = "Lifts."
+data = "four demonstrations"
+recipe = "one minute"
+licence = "MIT"
+[results.seen]
+mujoco = "90 %"
+[results.others]
+sapien = "70 %"
+"""
+
+
 class ShippedTest(WithPolicy):
     def setUp(self):
         """A folder of shipped policies with one in it, and another folder to work in."""
@@ -147,11 +162,7 @@ class ShippedTest(WithPolicy):
     def test_the_list_shows_the_cards(self):
         self.assertIn("the card of skilled.onnx", refused("policies", "list"))
         card = shipped.FOLDER / "skilled.toml"
-        text = (
-            'schema = "xreset-policy-card/1"\nabout = "Lifts."\ndata = "four demonstrations"\nrecipe = "one minute"\nlicence = "MIT"\n'
-            '[results.seen]\nmujoco = "90 %"\n[results.others]\nsapien = "70 %"\n'
-        )
-        card.write_text(text)
+        card.write_text(CARD)
         out = succeeds("policies", "list")
         for part in (
             "skilled: Lifts.",
@@ -164,8 +175,43 @@ class ShippedTest(WithPolicy):
             "70 %",
         ):
             self.assertIn(part, out)
-        card.write_text(text.replace("card/1", "card/9"))
+        card.write_text(CARD.replace("card/1", "card/9"))
         self.assertIn("states schema", refused("policies", "list"))
+
+    def test_the_name_of_a_robot_means_the_policy_that_its_card_states(self):
+        none = (
+            "No policy ships for the robot 'openarm', only for no robot: train one with xreset run"
+        )
+        self.assertRaisesRegex(PolicyError, none, load_policy, "openarm")
+        self.assertRaisesRegex(PolicyError, none, default_policy, "openarm")
+        self.assertEqual(shipped.run_folder("openarm"), Path("openarm"))
+        (shipped.FOLDER / "skilled.toml").write_text('default_of = "openarm"\n' + CARD)
+        self.assertEqual(load_policy("openarm").name, "skilled")
+        self.assertEqual(default_policy(robot_folder("openarm")), "skilled")
+        self.assertEqual(shipped.run_folder("openarm"), Path("runs/skilled"))
+        self.assertIn("openarm, whose name means this policy", succeeds("policies", "list"))
+        other = "for the robot 'ur7e-robotiq', only for openarm: train one with xreset run DEMOS"
+        for command in (
+            ("play", "--robot", "ur7e-robotiq"),
+            ("eval", "ur7e-robotiq", "--demos", "x.npz"),
+            ("stress", "ur7e-robotiq"),
+            ("export", "deploy", "ur7e-robotiq", "--out", "robotiq"),
+        ):
+            with self.subTest(command):
+                self.assertIn(other, refused(*command))
+        shutil.copy(shipped.FOLDER / "skilled.onnx", shipped.FOLDER / "openarm.onnx")
+        self.assertEqual(load_policy("openarm").name, "openarm")
+
+    def test_a_policy_of_another_robot_is_refused(self):
+        words = "skilled is a policy of the robot 'openarm', not of 'ur7e-robotiq'"
+        for command in (
+            ("play", "skilled"),
+            ("eval", "skilled", "--demos", "x.npz"),
+            ("stress", "skilled"),
+            ("export", "deploy", "skilled", "--out", "robotiq"),
+        ):
+            with self.subTest(command):
+                self.assertIn(words, refused(*command, "--robot", "ur7e-robotiq"))
 
     def test_it_knows_which_objects_it_was_not_trained_with(self):
         self.assertEqual(load_policy("skilled").unseen((SOUP, "mug", "bowl")), ("bowl", "mug"))

@@ -124,7 +124,7 @@ class Fingerprint(Copied):
         other = load(self.folder)
         task = TaskConfig()
         check_contract("p.onnx", policy_contract(robot, task, ()), other, task)
-        with self.assertRaisesRegex(PolicyError, "another robot .robot: 'other', here 'openarm'"):
+        with self.assertRaisesRegex(PolicyError, "of the robot 'other', not of 'openarm'"):
             check_contract("p.onnx", policy_contract(other, task, ()), robot, task)
 
 

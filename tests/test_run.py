@@ -10,12 +10,12 @@ from xreset.cli import perform
 from xreset.cli import run as command
 from xreset.demos.archive import write_demos
 from xreset.demos.synth import synthesize
-from xreset.errors import RunError
+from xreset.errors import FileFormatError, RunError
 from xreset.retarget.file import read_retargeted, write_retargeted
 
 
 class Run(InFolder, TestCase):
-    def run_it(self, demos="soup.npz"):
+    def run_it(self, demos="soup.npz", robot="ur7e-sharpa"):
         """Run with real motion and bank; return the verbs of all steps."""
         verbs = []
 
@@ -27,7 +27,7 @@ class Run(InFolder, TestCase):
                 perform(words)
 
         with patch.object(command, "perform", step):
-            xreset.run(f"{self.folder}/{demos}", robot="ur7e-sharpa", out=f"{self.folder}/v0.1")
+            xreset.run(f"{self.folder}/{demos}", robot=robot, out=f"{self.folder}/v0.1")
         return verbs
 
     def test_steps_that_are_done_are_left_out(self):
@@ -39,6 +39,8 @@ class Run(InFolder, TestCase):
         self.assertEqual(self.run_it(), ["resets", "train", "eval", "report"])
         with self.assertRaisesRegex(RunError, "another archive of demonstrations"):
             self.run_it("other.npz")
+        with self.assertRaisesRegex(FileFormatError, "the robot 'ur7e-sharpa' .* 'openarm' has"):
+            self.run_it(robot="openarm")
         motion = self.folder / "v0.1/motion.npz"
         write_retargeted(motion, read_retargeted(motion))  # states no inputs
         with self.assertRaisesRegex(RunError, "motion.npz was made with another archive"):

@@ -1372,7 +1372,7 @@ class PolicyTest(TestCase):
     def test_refusals_name_what_differs(self):
         layout = policy_contract(self.robot, self.TASK, ()).observation_layout
         tactile = layout | {"policy": layout["policy"] | {"tactile": 4}}
-        robot = "another robot .robot: 'openarm', here 'toy'.*Use the robot 'openarm'"
+        robot = "a policy of the robot 'openarm', not of 'toy': use 'openarm', or another policy"
         schema = "schema is 'xreset-policy/9', expected one of 'xreset-policy/1'"
         for words, name, value in (
             (robot, "robot", "openarm"),

@@ -31,7 +31,7 @@ from xreset.pictures.view.server import (
     chosen,
     serve_until_interrupted,
 )
-from xreset.policy.shipped import shipped_graphs
+from xreset.policy.shipped import shipped_graphs, shipped_name
 
 if TYPE_CHECKING:
     from xreset.eval.policy_spec import PolicySpec
@@ -60,7 +60,7 @@ GROWTH = 1.03
 """Size of the goal next to the object, so that a pointer meets the goal first where both are in one place."""
 
 
-def serve(policy: str | Path | PolicySpec, *, host: str, port: int, **options: Any) -> None:
+def serve(policy: str | Path | PolicySpec | None, *, host: str, port: int, **options: Any) -> None:
     """Serve a live episode until Ctrl-C; ``options`` are those of :class:`~xreset.eval.play.session.Session`."""
     print("Loading the policy, the object and the engine ...", flush=True)
     session = Session(policy, **options)
@@ -306,8 +306,9 @@ class Page(WebPage):
         )
         self._object = gui.add_dropdown("object", ("",))
         self._engine = gui.add_dropdown("engine", backend_names())
+        self._opened = self.session.policy
         self._policies = {
-            self.session.policy.name: self.session.policy,
+            self._opened.name: self._opened,
             **{name: name for name in shipped_graphs()},
             RESTS: RESTS,
         }
@@ -367,8 +368,8 @@ class Page(WebPage):
         engine = chosen(self._engine, session.engine)
         object_name = self._names.get(self._object.value, session.object_name)
         if robot != session.policy.robot.name:
-            choice = partial(session.choose_policy, RESTS, robot=robot)
-        elif policy != session.policy.name:
+            policy = self._usual_policy(robot)
+        if (robot, policy) != (session.policy.robot.name, session.policy.name):
             choice = partial(
                 session.choose_policy,
                 self._policies[policy],
@@ -383,6 +384,13 @@ class Page(WebPage):
         with self._loading():
             choice()
             self._make_scene()
+
+    def _usual_policy(self, robot: str) -> str:
+        """Return the policy with which a robot begins: the one that was opened first, one that ships, or none."""
+        if robot == self._opened.robot.name:
+            return self._opened.name
+        name = shipped_name(robot)
+        return name if name in self._policies else RESTS
 
     def _write(self) -> None:
         """Show text and curves."""

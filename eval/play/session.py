@@ -18,7 +18,7 @@ from xreset.backends.single import SingleWorld
 from xreset.demos.synth import synthesize
 from xreset.errors import XResetError
 from xreset.eval.metrics import GOAL_ANGLE, GOAL_DISTANCE
-from xreset.eval.policy_spec import PolicySpec, load_policy
+from xreset.eval.policy_spec import PolicySpec, default_policy, load_policy
 from xreset.files.checks import frozen
 from xreset.geometry.dynamics import drive_values
 from xreset.geometry.kinematics import on_host
@@ -123,7 +123,7 @@ class Session:
 
     def __init__(
         self,
-        policy: str | Path | PolicySpec = "many-objects",
+        policy: str | Path | PolicySpec | None = None,
         *,
         object_name: str | None = None,
         engine: str = "mujoco",
@@ -136,7 +136,7 @@ class Session:
 
         Args:
             policy: as for :func:`~xreset.eval.policy_spec.load_policy`, without cameras; of the baselines only
-                :data:`RESTS`.
+                :data:`RESTS`. None: as :func:`~xreset.eval.policy_spec.default_policy` says.
             object_name: name of the object; None: the soup can, or else the first object.
             engine: name of the engine.
             robot: default: the policy's.
@@ -152,7 +152,7 @@ class Session:
         self._seed = seed
         self.random = np.random.default_rng(seed)
         self.time = 0.0
-        self._open(policy, robot, object_name, engine)
+        self._open(policy or default_policy(robot), robot, object_name, engine)
 
     # Choosing ---------------------------------------------------------------------------------------------------------
 

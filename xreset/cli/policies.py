@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from xreset.cli._terminal import console, show_table
-from xreset.policy.shipped import card, shipped
+from xreset.policy.shipped import card, shipped, shipped_name
 
 
 def policies() -> None:
@@ -15,7 +15,7 @@ def policies() -> None:
         about = card(file)
         console.print(f"{name}: {about.about}")
         facts = {
-            "robot": contract.robot,
+            "robot": _robot(contract.robot, name),
             "objects": _objects(contract.objects),
             "data": about.data,
             "recipe": about.recipe,
@@ -30,6 +30,13 @@ def policies() -> None:
         for episodes, by_engine in about.results.items():
             table.append((episodes, *(by_engine.get(engine, "") for engine in engines)))
         show_table(table)
+
+
+def _robot(robot: str, policy: str) -> str:
+    """Return the name of a policy's robot, and whether this name means the policy."""
+    if shipped_name(robot) != policy:
+        return robot
+    return f"{robot}, whose name means this policy (xreset play --robot {robot})"
 
 
 def _objects(trained: tuple[str, ...]) -> str:

@@ -65,6 +65,8 @@ def run(
     from xreset.demos.archive import read_demos
     from xreset.eval.study import steps
     from xreset.geometry.description import load_robot
+    from xreset.retarget.file import read_retargeted
+    from xreset.spec import check_robot
 
     demos = Path(demos)
     out = Path(out)
@@ -75,7 +77,9 @@ def run(
     motion = out / "motion.npz"
     bank = out / "resets.npz"
     out.mkdir(parents=True, exist_ok=True)
-    if not _made_from(motion, demos=file_hash(demos), robot=spec.fingerprint):
+    if motion.is_file():
+        check_robot(motion, "file of motion", read_retargeted(motion), spec)
+    if not _made_from(motion, demos=file_hash(demos)):
         _step("retarget", demos, robot=robot, out=motion, meshes=meshes)
     if not _made_from(bank, retargeted=file_hash(motion)):
         own = robot if os.path.isdir(robot) else None
@@ -141,7 +145,7 @@ def _made_from(path: Path, **sources: str) -> bool:
     return True
 
 
-_NAMES = {"demos": "archive of demonstrations", "robot": "robot", "retargeted": "motion"}
+_NAMES = {"demos": "archive of demonstrations", "retargeted": "motion"}
 
 
 def _step(verb: str, *words: object, **options: object) -> None:

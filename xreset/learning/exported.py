@@ -10,8 +10,9 @@ from xreset.errors import PolicyError
 from xreset.files.checks import frozen
 from xreset.files.storage import file_hash
 from xreset.learning.run import RunInfo, checkpoints, played_checkpoint, read_run
+from xreset.physics.plugins import robot_names
 from xreset.policy.onnx_policy import OnnxPolicy, policy_content
-from xreset.policy.shipped import results_folder, shipped
+from xreset.policy.shipped import no_policy_for, results_folder, shipped, shipped_name
 from xreset.runtime.contract import POLICY
 
 
@@ -22,7 +23,7 @@ class PolicyFile:
     name: str
     """What results call the policy."""
     path: Path
-    """The file; or what messages call a policy that is in no file."""
+    """The file; or what messages call a policy that ships or that is in no file."""
     content: bytes
     results: Path
     """Default folder of the policy's results."""
@@ -37,7 +38,7 @@ class PolicyFile:
 
 def find_policy(policy: str | Path, *, also: Sequence[str] = ()) -> PolicyFile:
     """Find a run folder's policy, that of a checkpoint, an exported or deployed one, or one that ships with xreset, in
-    this order.
+    this order. The name of a robot means the policy that ships for it.
 
     Args:
         policy: folder, file (``.onnx``, or ``RUN/checkpoints/NUMBER.pt``) or name.
@@ -58,15 +59,17 @@ def find_policy(policy: str | Path, *, also: Sequence[str] = ()) -> PolicyFile:
     if path.suffix == ".onnx" or os.path.exists(path):
         content = policy_content(path)
         return PolicyFile(name=path.stem, path=path, content=content, results=path.parent)
-    name = str(policy)
+    name = shipped_name(str(policy))
     files = shipped()
-    if name not in files:
+    if name is None and str(policy) in robot_names():
+        raise PolicyError(no_policy_for(str(policy)))
+    if name is None:
         known = ", ".join((*also, *files))
         raise PolicyError(
-            f"Unknown policy {name!r}. Give a run folder, a .onnx file, or one of: {known}."
+            f"Unknown policy {str(policy)!r}. Give a run folder, a .onnx file, or one of: {known}."
         )
     content = policy_content(files[name])
-    return PolicyFile(name=name, path=files[name], content=content, results=results_folder(name))
+    return PolicyFile(name=name, path=Path(name), content=content, results=results_folder(name))
 
 
 def read_policy(policy: str | Path) -> OnnxPolicy:

@@ -43,7 +43,7 @@ from xreset.learning.run import (
 from xreset.learning.runner import TrainingRunner
 from xreset.physics.plugins import device_for
 from xreset.policy.onnx_policy import OnnxPolicy, check_contract
-from xreset.policy.shipped import shipped
+from xreset.policy.shipped import shipped_name
 from xreset.resets.bank import ResetBank, read_bank, write_bank
 from xreset.resets.goals import GoalSet, read_goals, with_goals, write_goals
 from xreset.resets.inputs import Inputs, load_inputs
@@ -292,7 +292,7 @@ def check_config(config: TrainConfig, inputs: Inputs, *, has_teacher: bool) -> N
 
 def checkpoint_to_start_from(run: Path, inputs: Inputs, config: TrainConfig) -> Path:
     """Return the newest checkpoint of another run, whose networks must be like those of this run."""
-    if run.suffix == ".onnx" or (not run.exists() and str(run) in shipped()):
+    if run.suffix == ".onnx" or (not run.exists() and shipped_name(str(run))):
         raise RunError(
             f"{run} has no critic and no checkpoint, so no training can start from it. Give a run folder (--weights)."
         )

@@ -106,13 +106,22 @@ def check_contract(source: str, contract: Contract, robot: RobotSpec, task: Task
     _compare(source, contract, here, robot)
 
 
+def of_another_robot(source: str, trained: str, wanted: str) -> PolicyError:
+    """Return the refusal of a policy, given the names of its robot and of the robot that shall play it."""
+    return PolicyError(
+        f"{source} is a policy of the robot {trained!r}, not of {wanted!r}: use {trained!r}, or another policy "
+        "(xreset policies lists those that ship)."
+    )
+
+
 def _compare(source: str, contract: Contract, here: Contract, robot: RobotSpec) -> None:
     """Raise ``PolicyError`` for the first part in which a contract differs from the one of a robot and a task here."""
     if robot.like and contract.robot_fingerprint == robot.like:
         here = replace(here, robot=contract.robot, robot_fingerprint=robot.like)
+    if contract.robot != here.robot:
+        raise of_another_robot(source, contract.robot, robot.name)
     use_robot = f"Use the robot {contract.robot!r}."
     fixes = {
-        "robot": use_robot,
         "joint order": use_robot,
         "fingertips": use_robot,
         "version of the robot": "Its URDF or description has changed. Train again.",
@@ -146,7 +155,6 @@ def _meaning(contract: Contract) -> dict[str, dict[str, Any]]:
     for group, terms in contract.observation_layout.items():
         widths |= {f"{group}.{term}": width for term, width in terms.items()}
     return {
-        "robot": {"robot": contract.robot},
         "joint order": {"joint_names": contract.joint_names},
         "fingertips": {"fingertip_names": contract.fingertip_names},
         "version of the robot": {"robot_fingerprint": contract.robot_fingerprint},

@@ -1,7 +1,8 @@
 """Trained policies that ship with xreset: ``NAME.onnx`` in this folder, the card ``NAME.toml``, and the deployed graph
 without its weights, ``NAME.graph``.
 
-The command line knows such a policy as NAME.
+The command line knows such a policy as NAME. The name of a robot means the policy of the same name, or the one whose
+card states the robot as ``default_of``.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from pathlib import Path
 
 from xreset.files.checks import from_dict, frozen
 from xreset.files.storage import read_toml
+from xreset.physics.plugins import robot_names
 
 FOLDER = Path(__file__).parent
 """Folder of the policies and their cards."""
@@ -30,11 +32,43 @@ class Card:
     licence: str
     results: dict[str, dict[str, str]]
     """Episodes -> engine -> task progress with its interval."""
+    default_of: str | None = None
+    """Robot whose name means this policy; not needed where the policy is named after the robot."""
 
 
 def shipped() -> dict[str, Path]:
     """Name -> file of every policy that ships with this installation, in order of name."""
     return {file.stem: file for file in sorted(FOLDER.glob("*.onnx"))}
+
+
+def shipped_name(name: str) -> str | None:
+    """Return the name of the shipped policy that a name means: its own, or that of a robot; None: there is none."""
+    files = shipped()
+    if name in files:
+        return name
+    for other, file in files.items():
+        if file.with_suffix(".toml").exists() and card(file).default_of == name:
+            return other
+    return None
+
+
+def default_policies() -> dict[str, str]:
+    """Robot -> name of the shipped policy that the robot's name means."""
+    found = {}
+    for robot in robot_names():
+        name = shipped_name(robot)
+        if name is not None:
+            found[robot] = name
+    return found
+
+
+def no_policy_for(robot: str) -> str:
+    """Return what to tell a user who wants the policy of a robot that has none."""
+    others = ", ".join(default_policies()) or "no robot"
+    return (
+        f"No policy ships for the robot {robot!r}, only for {others}: train one with "
+        f"xreset run DEMOS --robot {robot} --out RUN, and give its folder RUN."
+    )
 
 
 def shipped_graphs() -> dict[str, Path]:
@@ -70,9 +104,8 @@ def card(file: Path) -> Card:
 
 def run_folder(run: str | Path) -> Path:
     """Return the folder of a run; or that of a shipped policy's results, if no file or folder has its name."""
-    if not Path(run).exists() and str(run) in shipped():
-        return results_folder(str(run))
-    return Path(run)
+    name = None if Path(run).exists() else shipped_name(str(run))
+    return Path(run) if name is None else results_folder(name)
 
 
 def results_folder(name: str) -> Path:

@@ -209,11 +209,10 @@ class EvalResult(Brief, Checked):
         about |= {name: getattr(self, name) for name in ("policy", "engine", "robot", "seed")}
         return pd.concat([self.episodes.assign(**about)[list(about)], self.episodes], axis=1)
 
-    def meshes_folder(self, given: Path | None) -> Path | None:
+    def meshes_folder(self, given: str | Path | None) -> Path | None:
         """Return the given folder of meshes, or else that of the evaluation; None: the stand-ins."""
-        if given is not None or self.meshes is None:
-            return given
-        return Path(self.meshes)
+        folder = given or self.meshes
+        return Path(folder) if folder else None
 
 
 class Evaluation(list[EvalResult]):

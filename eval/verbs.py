@@ -6,7 +6,7 @@ They import most of what they need when they are called, because the help of a c
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -14,13 +14,24 @@ from typing import TYPE_CHECKING, Annotated, Any
 from xreset.errors import XResetError
 from xreset.eval.conditions import FAULTS, SWEPT, Condition, Property, chosen, nominal_task
 from xreset.eval.report import X
-from xreset.files.checks import Mp4, Option, Output, Port, PositiveInt, Seed, obeys_rules
+from xreset.files.checks import (
+    Mp4,
+    NonNegativeInt,
+    Option,
+    Output,
+    Port,
+    PositiveInt,
+    Seed,
+    obeys_rules,
+)
 from xreset.files.progress import unseen
-from xreset.files.storage import claim_folder
+from xreset.files.storage import claim_folder, file_hash, measured, write_json
 from xreset.physics.plugins import Device
 
 if TYPE_CHECKING:
+    from xreset.eval.engines.agreement import Parity
     from xreset.eval.engines.attribution import Attribution
+    from xreset.eval.engines.replay import TraceResult
     from xreset.eval.export.recorded import RecordedEpisodes
     from xreset.eval.policy_spec import PolicySpec
     from xreset.eval.report.make import Report
@@ -28,7 +39,8 @@ if TYPE_CHECKING:
     from xreset.eval.rollout import Engine
     from xreset.resets.inputs import Data
 else:  # a command has texts in place of these
-    Attribution = RecordedEpisodes = PolicySpec = Report = Evaluation = Engine = Data = Any
+    Attribution = Parity = TraceResult = RecordedEpisodes = PolicySpec = Report = Any
+    Evaluation = Engine = Data = Any
 
 
 @obeys_rules
@@ -277,6 +289,108 @@ def attribute(
     return attribution.attribute(
         spec, a, b, trial, folder, episodes=episodes, only=wanted, progress=progress
     )
+
+
+@obeys_rules
+def compare_engines(
+    motion: str | Path,
+    engines: Annotated[str | Engine | Sequence[str | Engine], Option("engine")],
+    *,
+    robot: str | Path | None = None,
+    meshes: str | Path | None = None,
+    only: Sequence[str] = (),
+    grasps: PositiveInt = 48,
+    device: Device = "cpu",
+    json: Output | None = None,
+    progress: Callable[[str, float, int], None] = unseen,
+) -> Parity:
+    """Measure how far physics engines agree with MuJoCo on grasps. The command exits with 1 if one misses a target.
+
+    Press: a hand closes on an object that cannot move. Closing: a hand closes on an object on the table, lifts and
+    shakes it. Hold: lift and shake from a common state. The column of MuJoCo at half the timestep shows how far two
+    solutions of the same equations differ. The command leaves out MuJoCo-Warp on a CPU, where it is slow, unless it is
+    named.
+
+    Args:
+        motion: file with the grasps: of xreset retarget, or of xreset demos, which is retargeted first.
+        engines: physics engine to measure, or several; the command's default: all that can be used here.
+        robot: name or folder of the robot; default: the file's.
+        meshes: folder of real meshes; default: as the file names it, else the stand-ins.
+        only: object to use, or several; default: all objects of the file.
+        grasps: number of closings, and of holds.
+        device: where engines run that can use a GPU: cpu or cuda; the others run on the CPU.
+        json: file to write the results to.
+        progress: called with (current try, tries done, tries in all).
+
+    Raises:
+        DemoError: the file shows no grasp.
+        XResetError: an engine is unknown or cannot be used here.
+    """
+    from xreset.eval.engines import agreement
+    from xreset.eval.rollout import chosen_engines
+    from xreset.resets.inputs import load_inputs
+
+    tested = [each for each in chosen_engines(engines, device) if each.name != agreement.REFERENCE]
+    inputs = load_inputs(motion, robot=robot, meshes=meshes, only=only, accept=("demos", "motion"))
+    grasped = inputs.motion(partial(progress, "retargeting"))
+    # hashed now, because after minutes of work the file may have changed
+    hashes = {"motion": file_hash(motion)}
+    found = agreement.compare(
+        inputs.robot, inputs.objects, grasped, tested, grasps=grasps, progress=progress
+    )
+    if json is not None:
+        write_json(json, measured(asdict(found) | {"ok": not found.missed, "inputs": hashes}))
+    return found
+
+
+@obeys_rules
+def trace_engines(
+    source: str | Path,
+    engines: Annotated[str | Sequence[str], Option("engine")],
+    *,
+    reference: str = "mujoco",
+    object_name: Annotated[str | None, Option("object")] = None,
+    episode: NonNegativeInt = 0,
+    robot: str | Path | None = None,
+    meshes: str | Path | None = None,
+    seed: Seed = 0,
+    device: Device = "cpu",
+    out: Output = Path("runs/trace"),
+    progress: Callable[[str, float, int], None] = unseen,
+) -> TraceResult:
+    """Replay the same actions from the same state in several engines, and show when and by how much they diverge.
+
+    Args:
+        source: source of the actions. Demonstrations or robot motion: an open-loop grasp and lift. The trace of an
+            evaluation (eval/ENGINE.trace.npz): an episode of the policy.
+        engines: engine to compare with the reference, or several; the command's default: all that can be used here.
+        reference: engine that the others are compared with.
+        object_name: object, if the source has several; default: the first.
+        episode: which of the object's grasps or recorded episodes.
+        robot: name or folder of the robot; default: the policy's, or the file's.
+        meshes: folder of real meshes; default: what the policy was trained with, else the stand-ins.
+        seed: seed of the perturbed starts, which are the same in every engine.
+        device: where engines run that can use a GPU: cpu or cuda.
+        out: folder for trace.json.
+        progress: called with the name of each engine as it begins.
+
+    Raises:
+        DemoError: the file has no such object, grasp or episode.
+        XResetError: the reference itself does not stay finite, or an engine cannot be used here.
+    """
+    from xreset.eval import rollout
+    from xreset.eval.engines import actions, replay
+
+    base = rollout.engine(reference, device=device)
+    chosen = (engines,) if isinstance(engines, str) else dict.fromkeys(engines)
+    others = [rollout.engine(name, device=device) for name in chosen if name != reference]
+    progress("actions", 0, 0)
+    played = actions.from_file(Path(source), object_name, episode, robot=robot, meshes=meshes)
+    found = replay.trace(
+        played, base, others, seed=seed, progress=lambda name: progress(name, 0, 0)
+    )
+    write_json(Path(out) / "trace.json", measured(found.as_dict()))
+    return found
 
 
 @obeys_rules

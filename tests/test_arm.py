@@ -244,7 +244,7 @@ class WritePlacementTest(InFolder):
         moved = replace(self.robot, joints=tuple(joints), **place)
         shares = {"reached": 0.9123, "dexterity": 0.5, "followed": 0.8765}
         rule = "the hand where it was"
-        self.best = Finalist(robot=moved, frames=321, home_rule=rule, **shares)
+        self.best = Finalist(robot=moved, frames=321, sequences=9, home_rule=rule, **shares)
         self.own = replace(self.best, robot=self.robot, followed=0.75, home_rule="as described")
 
     def write(self, best, command="x"):

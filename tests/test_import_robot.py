@@ -26,7 +26,7 @@ from xreset.robot_tools import check as checks
 from xreset.robot_tools import homes
 from xreset.robot_tools.check import check
 from xreset.robot_tools.draft import hand_side
-from xreset.robot_tools.importer import import_robot
+from xreset.robot_tools.importer import make_robot
 from xreset.robot_tools.sources import bare, read_source
 from xreset.spec import SceneSpec, TableSpec
 
@@ -117,7 +117,7 @@ class Toy(Robots):
 
     def imported(self, hand, arm=None, **options):
         """The folder of the arm with a hand, given as a text."""
-        made = import_robot(
+        made = make_robot(
             arm or self.arm, self.file("hand.urdf", hand), self.folder / "mine", **options
         )
         return made.folder
@@ -161,7 +161,7 @@ class Toy(Robots):
             }
             with self.subTest(y=y), mock.patch.dict(_PLACES, places):
                 hand = _hand(*map(_finger, ("f1", "f2", "thumb")))
-                made = import_robot(
+                made = make_robot(
                     self.arm, self.file("hand.urdf", hand), self.folder / f"mine{1e3 * y:g}"
                 )
                 tips = {
@@ -351,7 +351,7 @@ class Toy(Robots):
             self.read("circle.urdf", HAND.replace('<mimic joint="f1_1"', '<mimic joint="f1_2"'))
 
     def test_a_gripper_with_closed_loops_becomes_a_jaw(self):
-        made = import_robot(self.arm, self.file("jaw.xml", JAW), self.folder / "mine")
+        made = make_robot(self.arm, self.file("jaw.xml", JAW), self.folder / "mine")
         spec = load_robot(made.folder)
         self.assertEqual(errors(made.folder), [])
         self.assertEqual(len(spec.hand_indices), 1)
@@ -432,7 +432,7 @@ class Toy(Robots):
         text = MJCF.replace('name="base">', f'name="base">{"".join(slides)}')
         text = text.replace("</worldbody>", f"{_PEN}</worldbody>")
         exclude = '<contact><exclude body1="f1_a" body2="f2_a"/></contact></mujoco>'
-        made = import_robot(
+        made = make_robot(
             self.arm,
             self.file("hand.xml", text.replace("</mujoco>", exclude)),
             self.folder / "mine",
@@ -444,7 +444,7 @@ class Toy(Robots):
         self.assertIn(("f1_a", "f2_a"), load_robot(made.folder).collision_exclude)
 
     def test_an_object_next_to_the_hand_is_no_part_of_it(self):
-        made = import_robot(
+        made = make_robot(
             self.arm,
             self.file("hand.xml", MJCF.replace("</worldbody>", f"{_PEN}</worldbody>")),
             self.folder / "mine",
@@ -477,7 +477,7 @@ class Toy(Robots):
             'kp="3"', 'kp="900"'
         )
         text = text.replace('forcerange="-2 2"', 'forcerange="-999 999"')
-        made = import_robot(weak, self.file("hand.xml", text), self.folder / "weak")
+        made = make_robot(weak, self.file("hand.xml", text), self.folder / "weak")
         said = " ".join(made.guessed)
         for words in (
             r"efforts that such joints do not have: j0 \(1\), .*f1_1 \(999\)",
@@ -550,7 +550,7 @@ class Toy(Robots):
         self.assertIn("--thumb", str(refused.exception))
         for finger in ("f4", "f1"):
             out = self.folder / finger
-            import_robot(self.arm, self.file("hand.urdf", hand), out, thumb=f"{finger}_b")
+            make_robot(self.arm, self.file("hand.urdf", hand), out, thumb=f"{finger}_b")
             self.assertEqual(errors(out), [])
             self.assertEqual(load_robot(out).fingertips[0].contact_links, (f"{finger}_b",))
 
@@ -599,7 +599,7 @@ class Toy(Robots):
 
     def test_a_hand_whose_root_is_inside_it_is_moved_in_front_of_the_flange(self):
         """Its palm is along x, from 0 to 80 mm."""
-        made = import_robot(self.arm, self.hand, self.folder / "mine", rpy=(0, np.pi / 2, 0))
+        made = make_robot(self.arm, self.hand, self.folder / "mine", rpy=(0, np.pi / 2, 0))
         T = load_urdf(made.folder / "robot.urdf").joint("hand_base_fixed").T_parent_joint
         assert_allclose(T[:3, 3], (0, 0, 0.08), atol=1e-9)
         self.assertIn("80 mm along the flange's z axis", " ".join(made.guessed))
@@ -611,7 +611,7 @@ class Toy(Robots):
                 '<parent link="l5"/><child link="tool0"/></joint></robot>'
             )
             arm = self.file("turned.urdf", ARM.replace("</robot>", mount))
-            made = import_robot(arm, self.hand, self.folder / f"mine{axis}")
+            made = make_robot(arm, self.hand, self.folder / f"mine{axis}")
             spec = load_robot(made.folder)
             palm, last = Kinematics(spec).link_poses(tensor(spec.home), ["palm_frame", "l5"])
             fingers = (
@@ -646,7 +646,7 @@ class Toy(Robots):
         )
         for hand, options, words in refused:
             with self.subTest(words), self.assertRaisesRegex(RobotError, words):
-                import_robot(None, self.file("h.urdf", hand), self.folder / "no", **options)
+                make_robot(None, self.file("h.urdf", hand), self.folder / "no", **options)
         self.assertFalse((self.folder / "no").exists())
 
     def test_what_is_no_robot_of_an_arm_and_a_hand_is_named(self):
@@ -676,7 +676,7 @@ class Toy(Robots):
         described = load_robot("openarm")
         text = described.urdf.read_text()
         for name, urdf in (("one-drive", text), ("two-drives", re.sub("<mimic[^>]*>", "", text))):
-            made = import_robot(None, self.file(f"{name}.urdf", urdf), self.folder / name)
+            made = make_robot(None, self.file(f"{name}.urdf", urdf), self.folder / name)
             spec = load_robot(made.folder)
             self.assertEqual(len(spec.arm_indices), 7)
             at_start = spec.home[spec.hand_indices]
@@ -702,7 +702,7 @@ class Toy(Robots):
               <child link="camera"/><origin xyz="0.05 0 0.02"/>{_LIMIT}</joint></robot>"""
             file = self.file("whole.urdf", text.replace("</robot>", camera))
             with self.subTest(parent):
-                made = import_robot(None, file, self.folder / parent)
+                made = make_robot(None, file, self.folder / parent)
                 spec = load_robot(made.folder)
                 self.assertEqual([tip.contact_links[0] for tip in spec.fingertips], tips)
                 self.assertEqual(len(spec.arm_indices), 7)
@@ -751,7 +751,7 @@ class Toy(Robots):
             self.assertRaisesRegex(RobotError, words, self.imported, hand, **options)
         self.file("taken", "")
         with self.assertRaisesRegex(RobotError, "is there already"):
-            import_robot(self.arm, self.hand, self.folder / "taken")
+            make_robot(self.arm, self.hand, self.folder / "taken")
         self.assertEqual({path.name for path in self.folder.iterdir()}, {"hand.urdf", "taken"})
 
 
@@ -781,7 +781,7 @@ class Published(Robots):
         for number, code in enumerate(("th", "ff", "mf", "rf", "lf")):
             text = re.sub(rf'"({code}|{code.upper()})(?!\w*[./])', f'"part{number}', text)
         hand.write_text(text)
-        made = import_robot(arm, hand, self.folder / "mine")
+        made = make_robot(arm, hand, self.folder / "mine")
         spec = load_robot(made.folder)
         tree = load_urdf(spec.urdf)
         self.assertEqual(
@@ -823,7 +823,7 @@ class Published(Robots):
         ):
             with self.subTest(file):
                 name, model = file.split("/")
-                folder = import_robot(
+                folder = make_robot(
                     arm, self.unpacked(name) / model, self.folder / f"xarm7-{name}"
                 ).folder
                 spec = load_robot(folder)

@@ -34,7 +34,6 @@ from xreset.eval.engines.replay import (
     trace,
 )
 from xreset.eval.rollout import engine, roll_out
-from xreset.eval.setting import Place
 from xreset.geometry.rotations import quat_from_axis_angle
 from xreset.physics import State
 from xreset.task.config import RandomizationConfig, TaskConfig, TerminationConfig
@@ -325,7 +324,7 @@ class EvaluationTest(toy_results.InFolder):
             """The actions of an evaluation whose traces have some changes."""
             rollouts = replace(made, traces=tuple(replace(t, **changes) for t in made.traces))
             self.write_results("", rollouts, ("sapien",), robot.joint_names, robot="openarm")
-            return from_file(self.folder / "eval" / "sapien.trace.npz", Place(), thing, episode)
+            return from_file(self.folder / "eval" / "sapien.trace.npz", thing, episode)
 
         actions = load(0, SPAM)
         self.assertEqual(

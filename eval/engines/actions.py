@@ -14,7 +14,6 @@ from xreset.errors import DemoError, FileFormatError
 from xreset.eval.engines.grasps import Grasps, closing_episode, find_grasps
 from xreset.eval.results import TRACE_SCHEMA, Trace, read_result, read_traces
 from xreset.eval.rollout import nominal_scene
-from xreset.eval.setting import Place
 from xreset.files.checks import frozen
 from xreset.files.records import npz_schema
 from xreset.geometry.description import load_robot
@@ -49,14 +48,22 @@ class Actions:
         return self.scene.objects[0]
 
 
-def from_file(source: Path, place: Place, wanted: str | None = None, episode: int = 0) -> Actions:
+def from_file(
+    source: Path,
+    wanted: str | None = None,
+    episode: int = 0,
+    *,
+    robot: str | Path | None = None,
+    meshes: str | Path | None = None,
+) -> Actions:
     """Load actions from a file: a recorded episode, or an open-loop grasp and lift of one of its grasps.
 
     Args:
         source: the trace of an evaluation, or demonstrations or motion with grasps.
-        place: robot and meshes.
         wanted: name of an object of the file; default: its first.
         episode: index among the object's grasps or recorded episodes.
+        robot: name or folder of the robot; default: the file's.
+        meshes: folder of real meshes; default: as the file names it, else the stand-ins.
 
     Raises:
         FileFormatError: the file is of another kind, or for another robot.
@@ -64,11 +71,11 @@ def from_file(source: Path, place: Place, wanted: str | None = None, episode: in
     """
     schema = npz_schema(source)
     if schema == TRACE_SCHEMA:
-        return _from_evaluation(source, place, wanted, episode)
+        return _from_evaluation(source, wanted, episode, robot, meshes)
     inputs = load_inputs(
         source,
-        robot=place.robot,
-        meshes=place.meshes,
+        robot=robot,
+        meshes=meshes,
         only=(wanted,) if wanted else (),
         accept=("demos", "motion"),
     )
@@ -81,11 +88,17 @@ def from_file(source: Path, place: Place, wanted: str | None = None, episode: in
     return grasp_and_lift(inputs.robot, grasped, grasps[episode : episode + 1])
 
 
-def _from_evaluation(source: Path, place: Place, wanted: str | None, episode: int) -> Actions:
+def _from_evaluation(
+    source: Path,
+    wanted: str | None,
+    episode: int,
+    robot: str | Path | None,
+    meshes: str | Path | None,
+) -> Actions:
     """Return the actions of a recorded episode: an evaluation records the first episode of each demonstration."""
     name = source.name.removesuffix(".trace.npz")
     summary = read_result(source.with_name(f"{name}.json"))
-    spec = load_robot(place.robot or summary.robot)
+    spec = load_robot(robot or summary.robot)
     traces = read_traces(source.parent, name, spec.joint_names)
     chosen = wanted or traces[0].object
     mine = [trace for trace in traces if trace.object == chosen]
@@ -94,7 +107,7 @@ def _from_evaluation(source: Path, place: Place, wanted: str | None, episode: in
         raise DemoError(f"{source} has no {chosen}; it has {', '.join(names)}.")
     _check_episode(episode, len(mine), f"{source} records {len(mine)} episodes of {chosen}")
     found = mine[episode]
-    obj = load_object(chosen, summary.meshes_folder(place.meshes))
+    obj = load_object(chosen, summary.meshes_folder(meshes))
     return recorded_actions(
         spec, obj, found, label=f"{summary.policy} in {name}, demonstration {found.sequence}"
     )

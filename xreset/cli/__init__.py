@@ -43,9 +43,6 @@ The module ``xreset.cli.NAME`` has ``COMMAND``, a function or a dictionary of su
 if no verb is given. If defaults depend on the arguments, it has ``command_for`` instead, which returns the function for
 some arguments."""
 
-INVOCATION: list[str] = []
-"""Arguments of the command that is running."""
-
 
 def main(argv: list[str] | None = None) -> None:
     """Run the command line. It exits with 1 after an error, 2 after wrong usage, and 128 + N after signal N: 130 after
@@ -170,7 +167,6 @@ def _fail(argv: list[str], message: str) -> NoReturn:
 
 def perform(argv: list[str]) -> None:
     """Run the command that the first argument names. Its errors are raised."""
-    INVOCATION[:] = argv
     if not argv or asks_for_help(argv[:1]):
         print(_usage())
         return
@@ -186,6 +182,9 @@ def perform(argv: list[str]) -> None:
     import tyro
 
     from xreset.cli._options import RULES, checked, description, fitted
+    from xreset.files import storage
+
+    storage.INVOCATION[:] = argv
 
     def call(function: Callable[..., None], words: list[str], *verb: str) -> None:
         tyro.cli(

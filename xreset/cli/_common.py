@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 from tyro.conf import Positional, UseAppendAction, arg
 
-from xreset.cli import INVOCATION
 from xreset.cli._terminal import console, show_table
 from xreset.files import checks
-from xreset.files.storage import code_version, write_json
 from xreset.physics.plugins import Device as DeviceName
 from xreset.physics.plugins import backend_names, backend_status
 from xreset.retarget.accounts import Account, described
@@ -20,8 +17,6 @@ from xreset.retarget.accounts import Account, described
 if TYPE_CHECKING:
     from xreset.eval import rollout
 
-MEASURED = "xreset-measured/1"
-"""Schema of results that a command writes for its user, and that xreset does not read."""
 _T = TypeVar("_T")
 Source = Annotated[Path, Positional]
 """A file or folder, given without a flag."""
@@ -65,36 +60,22 @@ def usable_engines() -> list[str]:
     return [status.name for status in statuses if status.reason is None]
 
 
+def in_all_engines(arguments: dict[str, Any]) -> None:
+    """Let a command without engines use all that can be used here."""
+    arguments["engines"] = arguments.get("engines") or usable_engines()
+
+
+def in_quick_engines(arguments: dict[str, Any]) -> None:
+    """Let a command without engines use all that can be used here and are not slow on the device."""
+    arguments["engines"] = quick_engines(arguments.get("engines", ()), arguments["device"])
+
+
 def quick_engines(names: Sequence[str], device: str) -> list[rollout.Engine]:
     """Return the engines of these names; without names, all that can be used here and are not slow on the device."""
     from xreset.eval import rollout
 
     engines = rollout.chosen_engines(names or usable_engines(), device)
     return [each for each in engines if names or not each.slow]
-
-
-def measured(content: dict[str, Any]) -> dict[str, Any]:
-    """Return results with the version and the command that measured them, which tells what they are."""
-    about = {"xreset_version": code_version(), "command": this_command()}
-    return {"schema": MEASURED} | content | about
-
-
-def write_measured(path: Path | None, content: dict[str, Any]) -> None:
-    """Write results with the version and the command that measured them; path None: write nothing."""
-    if path is not None:
-        write_json(path, measured(content))
-        console.print(f"wrote {path}")
-
-
-def this_command() -> str:
-    """Return the running command as text, without the folders of files and the files of the results."""
-    words = list(INVOCATION)
-    for flag in ("--json", "--page"):
-        if flag in words:
-            i = words.index(flag)
-            del words[i : i + 2]
-    names = [Path(word).name if Path(word).exists() else word for word in words]
-    return shlex.join(["xreset", *names])
 
 
 def show_accounts(rows: Sequence[Account], title: str) -> None:

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict
-from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from rich.text import Text
@@ -14,30 +11,24 @@ from tyro.conf import arg
 from xreset.cli._common import (
     AllEngines,
     Device,
-    Flat,
-    Meshes,
-    Robot,
     Several,
-    Source,
-    measured,
-    quick_engines,
+    in_all_engines,
+    in_quick_engines,
     usable_engines,
-    write_measured,
 )
 from xreset.cli._options import Output
-from xreset.cli._terminal import Progress, console, show_table
+from xreset.cli._terminal import console, show_table
 from xreset.cli._verbs import verb
 from xreset.eval import verbs
-from xreset.eval.setting import Place
-from xreset.files.checks import NonNegativeInt, PositiveInt
-from xreset.files.storage import file_hash, write_json, write_whole
+from xreset.files.storage import measured, write_json, write_whole
 from xreset.physics.plugins import backend_class, backend_names, backend_status, make_backend
 from xreset.spec import SceneSpec
 
 if TYPE_CHECKING:
     from xreset.backends import conformance
-    from xreset.eval.engines import agreement
+    from xreset.eval.engines.agreement import Parity
     from xreset.eval.engines.attribution import Attribution
+    from xreset.eval.engines.replay import TraceResult
 
 
 def list_() -> None:
@@ -98,7 +89,9 @@ def check(
         )
         failed += sum(result.verdict == "failed" for result in results)
     found = measured({"schema": conformance.SCHEMA, "runs": runs})
-    write_measured(json, found)
+    if json is not None:
+        write_json(json, found)
+        console.print(f"wrote {json}")
     if page is not None:
         write_whole(page, pages.page([found]))
         console.print(f"wrote {page}")
@@ -171,59 +164,23 @@ def _text(measure: conformance.Measure | None) -> str:
     return text
 
 
-def compare(
-    motion: Source,
-    *,
-    robot: Robot = None,
-    meshes: Meshes = None,
-    only: Several = (),
-    engine: AllEngines = (),
-    grasps: PositiveInt = 48,
-    device: Device = "cpu",
-    json: Output | None = None,
-) -> None:
-    """Measure how far physics engines agree with MuJoCo on grasps. Exits with 1 if one misses a target.
-
-    Press: a hand closes on an object that cannot move. Closing: a hand closes on an object on the table, lifts and
-    shakes it. Hold: lift and shake from a common state. The column of MuJoCo at half the timestep shows how far two
-    solutions of the same equations differ. MuJoCo-Warp is left out on a CPU, where it is slow, unless it is named.
-
-    Args:
-        motion: File with the grasps: of `xreset retarget`, or of `xreset demos`, which is retargeted first.
-        only: Object to use; give it again for more. Default: all objects of the file.
-        grasps: Number of closings, and of holds.
-        json: File to write the results to.
-    """
-    from xreset.eval.engines import agreement
-    from xreset.resets.inputs import load_inputs
-
-    engines = [each for each in quick_engines(engine, device) if each.name != agreement.REFERENCE]
-    with Progress() as bar:
-        move = bar.stages()
-        loaded = load_inputs(
-            motion, robot=robot, meshes=meshes, only=only, accept=("demos", "motion")
-        )
-        grasped = loaded.motion(partial(move, "retargeting"))
-        # hashed now, because after minutes of work the file may have changed
-        inputs = {"motion": file_hash(motion)}
-        result = agreement.compare(
-            loaded.robot, loaded.objects, grasped, engines, grasps=grasps, progress=move
-        )
-    _print(result)
-    for tested in (result.reference, result.floor, *result.engines):
+def _show_agreement(found: Parity, options: Mapping[str, Any]) -> None:
+    _print(found)
+    for tested in (found.reference, found.floor, *found.engines):
         if tested.broken_worlds:
             console.print(
                 f"{tested.engine}: {tested.broken_worlds} worlds were not finite or dropped contacts",
                 style="bold red",
             )
-    write_measured(json, asdict(result) | {"ok": not result.missed, "inputs": inputs})
-    if result.missed:
-        console.print(f"missed: {'; '.join(result.missed)}", style="bold red")
+    if options["json"]:
+        console.print(f"wrote {options['json']}")
+    if found.missed:
+        console.print(f"missed: {'; '.join(found.missed)}", style="bold red")
         raise SystemExit(1)
     console.print("all targets met", style="bold green")
 
 
-def _print(result: agreement.Parity) -> None:
+def _print(result: Parity) -> None:
     columns = (result.floor, *result.engines)
     holds = dict(result.reference.carried)
     closings = holds.pop("closing")
@@ -252,44 +209,13 @@ def _number(value: float | None, unit: str) -> str:
     return f"{value:.3g} {unit}" if unit else f"{100 * value:.1f} %"
 
 
-def trace(
-    source: Source,
-    *,
-    engine: Several = (),
-    reference: str = "mujoco",
-    object: str | None = None,
-    episode: NonNegativeInt = 0,
-    place: Flat[Place] = Place(),
-    out: Output = Path("runs/trace"),
-) -> None:
-    """Replay the same actions from the same state in several engines, and show when and by how much they diverge.
+def _show_trace(found: TraceResult, options: Mapping[str, Any]) -> None:
+    from xreset.eval.engines import replay
 
-    Args:
-        source: Source of the actions. Demonstrations or robot motion: an open-loop grasp and lift. The trace of an
-            evaluation (eval/ENGINE.trace.npz): an episode of the policy.
-        engine: Engine to compare with the reference; give it again for more. Default: all that can be used here.
-        reference: Engine that the others are compared with.
-        object: Object, if the source has several; default: the first.
-        episode: Which of the object's grasps or recorded episodes.
-        place: Robot, meshes, seed, device.
-        out: Folder for trace.json.
-    """
-    from xreset.eval import rollout
-    from xreset.eval.engines import actions, replay
-
-    base = rollout.engine(reference, device=place.device)
-    names = [name for name in dict.fromkeys(engine) or usable_engines() if name != reference]
-    engines = [rollout.engine(name, device=place.device) for name in names]
-    with Progress() as bar:
-        move = bar.stages()
-        move("actions")
-        played = actions.from_file(source, place, object, episode)
-        result = replay.trace(played, base, engines, seed=place.seed, progress=move)
-        write_json(out / "trace.json", measured(result.as_dict()))
-    console.print(replay.rich_table(result))
-    for sentence in replay.sentences(result):
+    console.print(replay.rich_table(found))
+    for sentence in replay.sentences(found):
         console.print(sentence)
-    console.print(f"results in {out}")
+    console.print(f"results in {options['out']}")
 
 
 def _show_attribution(found: Attribution, options: Mapping[str, Any]) -> None:
@@ -311,7 +237,7 @@ def _show_attribution(found: Attribution, options: Mapping[str, Any]) -> None:
 COMMAND = {
     "": list_,
     "check": check,
-    "compare": compare,
-    "trace": trace,
+    "compare": verb(verbs.compare_engines, _show_agreement, prepare=in_quick_engines, engines=()),
+    "trace": verb(verbs.trace_engines, _show_trace, prepare=in_all_engines, engines=()),
     "attribute": verb(verbs.attribute, _show_attribution),
 }

@@ -8,6 +8,7 @@ import hashlib
 import json
 import os
 import secrets
+import shlex
 import shutil
 import stat
 import subprocess
@@ -28,6 +29,10 @@ T = TypeVar("T")
 RAISE_LIMIT = "If it is what you expect, raise the limit: set XRESET_MAX_FILE_MB (default 1024)."
 """Advice for a file that is too large."""
 
+INVOCATION: list[str] = []
+"""Words of the command that is running; none in a program that calls functions of xreset."""
+MEASURED = "xreset-measured/1"
+"""Schema of results that are written for a user, and that xreset does not read."""
 _MOST_LEVELS = 100
 """Most levels of nested JSON or TOML; some versions of Python read far more than other functions can walk through."""
 _TOO_DEEP = "it is nested too deeply"
@@ -265,6 +270,25 @@ def code_version() -> str:
             origin = json.loads(distribution("xreset").read_text("direct_url.json") or "{}")
             commit = str(origin.get("vcs_info", {}).get("commit_id", ""))[:12]
     return f"{__version__}+g{commit}" if commit else __version__
+
+
+def this_command() -> str:
+    """Return the running command as text, without the folders of files and the files of the results."""
+    if not INVOCATION:
+        return "a program that uses xreset"
+    words = list(INVOCATION)
+    for flag in ("--json", "--page"):
+        if flag in words:
+            i = words.index(flag)
+            del words[i : i + 2]
+    names = [Path(word).name if Path(word).exists() else word for word in words]
+    return shlex.join(["xreset", *names])
+
+
+def measured(content: dict[str, Any]) -> dict[str, Any]:
+    """Return results with the version and the command that measured them, which tells what they are."""
+    about = {"xreset_version": code_version(), "command": this_command()}
+    return {"schema": MEASURED} | content | about
 
 
 def write_json(path: str | Path, data: Any) -> None:

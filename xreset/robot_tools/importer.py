@@ -85,7 +85,7 @@ class Imported:
     """What its check finds: no errors."""
 
 
-def import_robot(
+def make_robot(
     arm: Path | None,
     hand: Path,
     out: Path,
@@ -96,24 +96,8 @@ def import_robot(
     rpy: tuple[float, float, float] | None = None,
     thumb: str | None = None,
 ) -> Imported:
-    """Make a robot's folder.
-
-    Args:
-        arm: URDF or MJCF of the arm; None: the hand's file holds the arm as well.
-        hand: URDF or MJCF of the hand. Joints that move all fingers become joints of the arm.
-        out: folder to make; it appears whole or not at all.
-        name: name of the robot; default: the folder's.
-        flange: link of the arm that carries the hand; default: its last one.
-        offset: position of the hand's root link in the flange's frame [m]; default: the flange's origin, or as far
-            out of the arm as keeps the hand's body before the flange.
-        rpy: roll, pitch and yaw of the hand's root link about the flange's fixed axes [rad]; default: as in the hand's
-            file, or turned so that the fingers point out of the arm.
-        thumb: a link or joint of the thumb, where names and geometry do not tell.
-
-    Raises:
-        RobotError: a file cannot be read, the folder exists, no fingers are found, or the robot would fail its check;
-            the message says what to do.
-    """
+    """Make a robot's folder, without a picture: see :func:`xreset.robot_tools.verbs.import_robot`. The folder appears
+    whole or not at all."""
     if is_occupied(out):
         raise RobotError(f"{out} is there already; give another folder, or remove it.")
     for option, values, most, unit in (

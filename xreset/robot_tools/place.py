@@ -124,6 +124,7 @@ def place(
                 dexterity=dexterity,
                 followed=followed / frames,
                 frames=frames,
+                sequences=sum(len(path.annotated) for path in paths),
                 home_rule=rule,
             )
         )

@@ -53,6 +53,8 @@ class Finalist:
     retarget``."""
     frames: int
     """Annotated frames of the motions."""
+    sequences: int
+    """Number of motions."""
     home_rule: str
     """How home was chosen; empty: no home was found."""
 

@@ -1,25 +1,158 @@
-"""``judge``, a function and a command: its signature has the options, its docstring the help.
+"""Functions that are commands as well: their signatures are the options, and their docstrings the help.
 
-It imports most of what it needs when it is called, because the help of a command is shown at once.
+They import most of what they need when they are called, because the help of a command is shown at once.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from xreset.files.checks import Option, Png, PositiveInt, obeys_rules
+from xreset.files.checks import Option, Output, Png, PositiveInt, obeys_rules
 from xreset.files.progress import unseen
+from xreset.files.storage import this_command
 from xreset.physics.plugins import Device
 from xreset.resets.config import JUDGE_SQUEEZE, SqueezeConfig
+from xreset.robot_tools.placement import Finalist, PlaceConfig, write_placement
 
 if TYPE_CHECKING:
     from xreset.resets.bank import ResetBank
+    from xreset.robot_tools.check import Finding
+    from xreset.robot_tools.importer import Imported
     from xreset.robot_tools.judge import Judgement
     from xreset.spec import ObjectSpec, RobotSpec
 else:  # a command has files and names in place of these
-    ResetBank = Judgement = ObjectSpec = RobotSpec = Any
+    ResetBank = Finding = Imported = Judgement = ObjectSpec = RobotSpec = Any
+
+Vector = tuple[float, float, float]
+_PER_OBJECT = 2
+"""Sequences of each object that a search for a placement tries, spread over the archive."""
+
+
+@obeys_rules
+def check_robot(robot: str | Path, *, picture: Png | None = None) -> list[Finding]:
+    """Check a robot, and list all errors and warnings. The command exits with 1 after an error.
+
+    xreset engines check --robot ROBOT tries it in the physics engines.
+
+    Args:
+        robot: name of a robot, or a folder with a robot.toml.
+        picture: PNG to write: the robot at home, with the frames of its palm, fingertips and joints.
+
+    Returns:
+        At least one finding for each topic; an error of ``description`` or ``URDF`` is the last one, and then there is
+        no picture.
+    """
+    from xreset.geometry.description import load_robot
+    from xreset.pictures.render import write_png
+    from xreset.robot_tools.check import check
+    from xreset.robot_tools.picture import robot_picture
+
+    found = check(robot)
+    if picture is not None and found[-1].topic not in ("description", "URDF"):
+        write_png(Path(picture), robot_picture(load_robot(robot)))
+    return found
+
+
+@obeys_rules
+def import_robot(
+    arm: Annotated[str | Path | None, Option("arm")],
+    hand: str | Path,
+    out: Output,
+    *,
+    name: str | None = None,
+    flange: str | None = None,
+    offset: Vector | None = None,
+    rpy: Vector | None = None,
+    thumb: str | None = None,
+) -> Imported:
+    """Make a robot's folder from the published files of an arm and a hand, or from one file of both.
+
+    Writes robot.urdf, the hulls of the meshes, a commented robot.toml and a picture, and lists what it guessed and what
+    only you can decide.
+
+    Args:
+        arm: URDF or MJCF of the arm; leave it out if the hand's file holds the arm as well.
+        hand: URDF or MJCF of the hand. Joints that move all fingers become joints of the arm.
+        out: folder to make.
+        name: name of the robot; default: the folder's.
+        flange: link of the arm that carries the hand; default: one that makers call so, or the arm's last link.
+        offset: position of the hand's root link in the flange's frame [m]; default: the origin, moved out of the arm
+            until the hand's body is in front of the flange.
+        rpy: roll, pitch and yaw of the hand about the flange's fixed axes [rad]; default: as in the hand's file, or
+            turned so that the fingers point out of the arm, along its last joint's axis.
+        thumb: a link or joint of the thumb, if the import chooses another finger.
+
+    Raises:
+        RobotError: a file cannot be read, the folder exists, no fingers are found, or the robot would fail its check;
+            the message says what to do.
+    """
+    from xreset.geometry.description import load_robot
+    from xreset.pictures.render import write_png
+    from xreset.robot_tools.importer import make_robot
+    from xreset.robot_tools.picture import robot_picture
+
+    made = make_robot(
+        Path(arm) if arm else None,
+        Path(hand),
+        Path(out),
+        name=name,
+        flange=flange,
+        offset=offset,
+        rpy=rpy,
+        thumb=thumb,
+    )
+    write_png(made.folder / "robot.png", robot_picture(load_robot(made.folder)))
+    return made
+
+
+@obeys_rules
+def place_robot(
+    robot: str | Path,
+    demos: str | Path,
+    *,
+    meshes: str | Path | None = None,
+    write: bool = False,
+    search: PlaceConfig = PlaceConfig(),
+    progress: Callable[[str, float, int], None] = unseen,
+) -> list[Finalist]:
+    """Find the base placement from which a robot's arm follows most of the demonstrations.
+
+    Args:
+        robot: name of a robot, or a folder with a robot.toml.
+        demos: archive of demonstrations (xreset demos).
+        meshes: folder of real meshes; default: the built-in stand-ins.
+        write: write the placement and its home into the robot's robot.toml.
+        search: ranges and effort of the search.
+        progress: called with (stage, done, in all).
+
+    Returns:
+        The finalists, those with a home first, and of these the one that follows most.
+
+    Raises:
+        RobotError: there is no wrist pose to reach, no room for the base, or the description cannot be changed.
+    """
+    import numpy as np
+
+    from xreset.demos.archive import demo_objects, read_demos, rest_on_table
+    from xreset.geometry.description import DESCRIPTION, load_robot, robot_folder
+    from xreset.retarget.pipeline import wrist_paths
+    from xreset.robot_tools.place import place
+
+    spec = load_robot(robot)
+    every = read_demos(demos)
+    chosen = every.select(max_per_object=_PER_OBJECT, spread=True)
+    objects = list(demo_objects(chosen, Path(meshes) if meshes else None).values())
+    paths = wrist_paths(chosen, spec, objects, progress=partial(progress, "hand retargeting"))
+    grounded = rest_on_table(every, objects)
+    wrists = grounded.hand_keypoints[grounded.hand_valid, 0]
+    avoid = np.concatenate((wrists, grounded.object_pos))
+    found = place(spec, paths, avoid, search, partial(progress, "placements"))
+    if write:
+        write_placement(robot_folder(robot) / DESCRIPTION, spec, found[0], this_command())
+    return found
 
 
 @obeys_rules

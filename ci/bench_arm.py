@@ -13,7 +13,7 @@ from rich.console import Console
 
 from xreset import robots
 from xreset.demos.archive import demo_objects, read_demos
-from xreset.demos.synth import synthesize
+from xreset.demos.verbs import synthesize
 from xreset.retarget.arm.config import ArmSearch
 from xreset.retarget.arm.model import ArmModel, ArmTargets
 from xreset.retarget.arm.solve import track

@@ -56,7 +56,7 @@ def run(options: Options, console: Console) -> None:
 def motion(robot: RobotSpec, folder: Path) -> ResetBank:
     """Starts and goals of one synthetic demonstration."""
     from xreset.demos.archive import write_demos
-    from xreset.demos.synth import synthesize
+    from xreset.demos.verbs import synthesize
     from xreset.resets.inputs import load_inputs
 
     file = folder / "demos.npz"

@@ -82,7 +82,7 @@ def held_grasp(robot: RobotSpec, objects: Sequence[ObjectSpec]) -> State:
     A retargeted synthetic demonstration gives the hand's shape. With the drives' targets each fingertip presses towards the object's centre.
     """
     from xreset.demos.archive import rest_on_table
-    from xreset.demos.synth import synthesize
+    from xreset.demos.verbs import synthesize
     from xreset.geometry.kinematics import Kinematics
     from xreset.retarget.verbs import retarget_demos
 

@@ -5,13 +5,14 @@ They import most of what they need when they are called, because the help of a c
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from xreset.errors import XResetError
+from xreset.errors import RunError, XResetError
 from xreset.eval.conditions import FAULTS, SWEPT, Condition, Property, chosen, nominal_task
 from xreset.eval.report import X
 from xreset.files.checks import (
@@ -41,6 +42,8 @@ if TYPE_CHECKING:
 else:  # a command has texts in place of these
     Attribution = Parity = TraceResult = RecordedEpisodes = PolicySpec = Report = Any
     Evaluation = Engine = Data = Any
+
+_warn = logging.getLogger(__name__).warning
 
 
 @obeys_rules
@@ -175,7 +178,7 @@ def stress(
         XResetError: a property is unknown or cannot have a value; nothing was played then.
     """
     wanted = chosen(properties, FAULTS if faults else SWEPT)
-    from xreset.demos.synth import synthesize
+    from xreset.demos.verbs import synthesize
     from xreset.eval import experiment
     from xreset.eval.policy_spec import load_policy
     from xreset.eval.results import Evaluation, write_result
@@ -450,6 +453,75 @@ def make_report(
         progress("drawing the film", 0, 0)
         found = replace(found, filmed=clips.make_film(found.evaluated, Path(film), **films))
     return found
+
+
+@obeys_rules
+def run_study(
+    study: str | Path,
+    *,
+    data: str | Path = Path("data"),
+    out: Output = Path("runs/studies"),
+    runs: Annotated[str | Sequence[str], Option("run")] = (),
+    only: Literal["all", "data", "train", "eval", "tables"] = "all",
+    dry_run: bool = False,
+    say: Callable[[str], None] = print,
+    note: Callable[[str], None] = _warn,
+) -> None:
+    """Run the missing steps of a study: reset banks, trainings, evaluations, and tables next to the paper's.
+
+    Steps run one after another. After a stop, the same command continues; finished steps are not repeated. Studies with
+    the same --out share their runs.
+
+    Args:
+        study: study file, or name of a study that ships with xreset.
+        data: folder with the study's demonstrations and meshes.
+        out: folder for all output.
+        runs: only this run of the study, or several; default: all.
+        only: kind of steps to run: reset banks, trainings, evaluations or tables.
+        dry_run: print the plan and its commands, and run nothing.
+        say: called with a line before each command, and with the lines of the plan.
+        note: called with what makes figures incomparable, doubtful or incomplete.
+
+    Raises:
+        RunError: the study or a run of it is unknown, or steps failed; finished steps are kept.
+    """
+    from xreset.eval.study import launch, plan, report
+    from xreset.eval.study.file import read_study, study_path
+
+    path = study_path(str(study))
+    chosen = [runs] if isinstance(runs, str) else runs
+
+    def planned() -> plan.Plan:
+        return plan.make_plan(
+            read_study(path), path.stem, given=Path(data), out=Path(out), only=chosen
+        )
+
+    todo = planned()
+    wanted = [step for step in todo.steps.values() if only in ("all", step.kind)]
+    if dry_run:
+        for step in wanted:
+            left, commands = step.todo()
+            after = [need for need in step.needs if todo.steps[need].left()]
+            waits = f" (after {', '.join(after)})" if after else ""
+            say(f"{step.name}: {left or 'done'}{waits}")
+            for command in commands:
+                say(f"    {launch.shown_command(command)}")
+        return
+    problems = []
+    if only != "tables":
+        for subset in todo.subsets():
+            subset.make()
+        undone = [step for step in wanted if step.left()]
+        problems = launch.launch(todo, undone, say)
+    if only in ("all", "tables"):
+        written = report.write_page(planned(), Path(out) / "reports" / todo.name)
+        for text in written.notes:
+            note(text)
+        say(f"page: {written.page}")
+    if problems:
+        raise RunError(
+            "\n".join([f"{len(problems)} steps failed. Finished steps are kept.", *problems])
+        )
 
 
 @obeys_rules

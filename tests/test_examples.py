@@ -49,7 +49,6 @@ class FaceTest(TestCase):
         elsewhere |= {"Module", "Literal", "None", "Any", "Self", "Data", "PositiveInt", "Seed"}
         # of functions that are commands, too
         elsewhere |= {"Annotated", "Device", "Option", "Output", "Port", "Pose", "Png"}
-        elsewhere |= {"Positional", "Several"}
         functions = 0
         for name in set(xreset.__all__) - {"VectorEnv"}:  # which needs gymnasium
             value = getattr(xreset, name)

@@ -46,10 +46,10 @@ from xreset.objects.meshes import (
     import_with_notes,
     read_mesh,
 )
-from xreset.objects.procedural import make_shapes
 from xreset.objects.properties import Properties
 from xreset.objects.rest import rest_height, resting_orientation
 from xreset.objects.sampling import bounding_box, keypoints, surface_points
+from xreset.objects.verbs import make_shapes
 from xreset.task.config import RandomizationConfig
 from xreset.task.randomization import own_friction
 
@@ -606,6 +606,6 @@ class RandomShapes(InFolder):
     def test_a_folder_is_never_overwritten(self):
         for words, folder, count in (
             ("exists. Name a new", self.folder, 1),
-            ("count is 0", self.folder / "none", 0),
+            ("count is 10001", self.folder / "none", 10_001),
         ):
             self.assertRaisesRegex(ObjectError, words, make_shapes, folder, count)

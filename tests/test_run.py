@@ -9,7 +9,7 @@ from tests.data import InFolder
 from xreset.cli import perform
 from xreset.cli import run as command
 from xreset.demos.archive import write_demos
-from xreset.demos.synth import synthesize
+from xreset.demos.verbs import synthesize
 from xreset.errors import FileFormatError, RunError
 from xreset.retarget.file import read_retargeted, write_retargeted
 

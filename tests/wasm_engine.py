@@ -21,7 +21,7 @@ import numpy as np
 from ci import try_page
 from xreset import evaluate
 from xreset.backends.pool import PoolBackend, World
-from xreset.demos.synth import synthesize
+from xreset.demos.verbs import synthesize
 from xreset.eval.rollout import Engine
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from xreset.backends.single import SingleWorld
-from xreset.demos.synth import synthesize
+from xreset.demos.verbs import synthesize
 from xreset.errors import XResetError
 from xreset.eval.metrics import GOAL_ANGLE, GOAL_DISTANCE
 from xreset.eval.policy_spec import PolicySpec, default_policy, load_policy

@@ -22,7 +22,7 @@ from typing import Any, Literal
 import numpy as np
 
 from xreset.demos.archive import read_demos, write_demos
-from xreset.demos.synth import synthesize
+from xreset.demos.verbs import synthesize
 from xreset.errors import RunError
 from xreset.eval.results import read_result
 from xreset.eval.study.file import Data, Evaluation, Runs

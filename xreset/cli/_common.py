@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional, UseAppendAction, arg
 
@@ -17,24 +17,14 @@ from xreset.retarget.accounts import Account, described
 if TYPE_CHECKING:
     from xreset.eval import rollout
 
-_T = TypeVar("_T")
 Source = Annotated[Path, Positional]
 """A file or folder, given without a flag."""
-Sources = Annotated[tuple[Path, ...], Positional]
-"""Files or folders, given without a flag."""
-Name = Annotated[str, Positional]
-"""A text, given without a flag."""
-Names = Annotated[tuple[str, ...], Positional]
-"""Texts, given without a flag."""
 Several = Annotated[tuple[str, ...], UseAppendAction]
 """A flag that may be given again. Its default must be empty, because values are appended to it."""
-Flat = Annotated[_T, arg(name="")]
-"""A dataclass whose fields are options of the command itself."""
 
 
 # Options that several commands share, with their help -----------------------------------------------------------------
 
-RobotName = Annotated[Name, arg(help="Name of a robot, or a folder with a robot.toml.")]
 Robot = Annotated[
     str | None, arg(help="Name or folder of the robot; default: the policy's, or the file's.")
 ]

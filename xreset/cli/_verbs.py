@@ -15,8 +15,8 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 
 from tyro.conf import Positional, UseAppendAction, arg
 
-from xreset.cli._terminal import Progress, show_notes
-from xreset.files.checks import Option, marks_in
+from xreset.cli._terminal import Progress, console, show_notes
+from xreset.files.checks import Option, Options, marks_in
 
 REQUIRED = Parameter.empty
 """Default of an argument that a command must have, and a function need not."""
@@ -35,7 +35,7 @@ def verb(
 
     Its first argument needs no flag, unless it is marked as an :class:`~xreset.files.checks.Option`. Of a union of
     types, those that a text can be are taken. A sequence is an option that is given again for each item. An argument
-    that no text can be is left out; ``progress`` moves a bar, and ``note`` prints a line.
+    that no text can be is left out; ``progress`` moves a bar, and ``note`` and ``say`` print a line.
 
     Args:
         function: the function.
@@ -66,6 +66,8 @@ def verb(
                 arguments[argument.name] = value
         if prepare is not None:
             prepare(arguments)
+        if "say" in hints:
+            arguments["say"] = console.print
         if "note" in hints:
             arguments["note"] = lambda text: show_notes([text])
         begun = monotonic()
@@ -94,6 +96,8 @@ def _option(argument: Parameter, hint: Any, *, is_positional: bool) -> Parameter
         if get_origin(kind) is Sequence:
             items += filter(_can_be_text, _kinds(get_args(kind)[0]))
     single = [kind for kind in kinds if _can_be_text(kind)]
+    if argument.default is not None and len(single) > 1:
+        single = [kind for kind in single if kind is not NoneType]
     marks = [mark for mark in marks_in(hint) if not isinstance(mark, Option)]
     default = argument.default
     if items:
@@ -108,6 +112,8 @@ def _option(argument: Parameter, hint: Any, *, is_positional: bool) -> Parameter
             default = () if default is None else default
     elif is_dataclass(default):
         option = type(default)
+        if isinstance(default, Options):
+            marks.append(arg(name=""))
     elif set(single) - {NoneType}:
         option = reduce(or_, single)
     else:

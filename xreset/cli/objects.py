@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from rich.text import Text
 
 from xreset.cli._common import Source
 from xreset.cli._options import Output, Png
 from xreset.cli._terminal import console, show_table
+from xreset.cli._verbs import verb
 from xreset.errors import ObjectError
-from xreset.files.checks import PositiveInt, Seed
+from xreset.objects import verbs
 from xreset.objects.properties import Properties
 from xreset.spec import ObjectSpec
 
@@ -120,20 +123,8 @@ def _cells(obj: ObjectSpec) -> tuple[str, ...]:
     )
 
 
-def make(*, out: Output, count: PositiveInt = 40, seed: Seed = 0) -> None:
-    """Make random shapes to train with: boxes, cans, cups, eggs, wedges, bottles, hammers and bananas.
-
-    Demonstrations of them: xreset demos synth --meshes FOLDER.
-
-    Args:
-        out: Folder of objects to write; it must not exist.
-        count: Number of shapes.
-        seed: Seed of sizes and masses.
-    """
-    from xreset.objects import procedural
-
-    written = procedural.make_shapes(out, count, seed)
-    console.print(f"{out}: {len(written)} shapes")
+def _show_made(written: Sequence[Path], options: Mapping[str, Any]) -> None:
+    console.print(f"{options['out']}: {len(written)} shapes")
 
 
-COMMAND = {"": list_, "import": import_, "make": make}
+COMMAND = {"": list_, "import": import_, "make": verb(verbs.make_shapes, _show_made)}

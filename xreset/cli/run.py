@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import os
 import shlex
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
-
-from tyro.conf import Positional
 
 from xreset.cli import perform
-from xreset.cli._common import Device, Several, quick_engines
+from xreset.cli._common import quick_engines
 from xreset.cli._terminal import console
+from xreset.cli._verbs import verb
 from xreset.errors import RunError
-from xreset.files.checks import PositiveInt, Seed
+from xreset.files.checks import PositiveInt, Seed, obeys_rules
 from xreset.files.records import stated_inputs
 from xreset.files.storage import file_hash
+from xreset.physics.plugins import Device
 
 _RETARGET = 0.025
 _RESETS = 0.055
@@ -24,13 +24,14 @@ _EPISODE = 1.0
 episode of 5 s in one engine (UR7e + Sharpa, nine YCB objects)."""
 
 
+@obeys_rules
 def run(
-    demos: Annotated[str | Path, Positional],
+    demos: str | Path,
     *,
     robot: str | Path,
     out: str | Path,
     meshes: str | Path | None = None,
-    engine: Several = (),
+    engine: str | Sequence[str] = (),
     recipe: str = "default",
     device: Device | None = None,
     num_envs: PositiveInt = 4096,
@@ -46,18 +47,18 @@ def run(
     that are done are left out, and the training continues.
 
     Args:
-        demos: Archive of demonstrations (`xreset demos`).
-        robot: Name of a robot, or the folder of its description.
-        out: Run folder to make, or to continue.
-        meshes: Folder of real meshes; default: the built-in stand-ins.
-        engine: Physics engine to evaluate in; give it again for more. Default: all that can be used here.
-        recipe: Recipe of the training, or another run's folder.
-        device: Where to train: cpu or cuda; default: cuda where there is a GPU.
-        num_envs: Worlds of the training.
-        minutes: Time of the whole training, without compiling kernels.
-        iterations: Most iterations of the training; default: the recipe's.
-        seed: Seed of the training and of the evaluations' starts.
-        episodes: Episodes of each demonstration in each engine.
+        demos: archive of demonstrations (xreset demos).
+        robot: name of a robot, or the folder of its description.
+        out: run folder to make, or to continue.
+        meshes: folder of real meshes; default: the built-in stand-ins.
+        engine: physics engine to evaluate in, or several; default: all that can be used here.
+        recipe: recipe of the training, or another run's folder.
+        device: where to train: cpu or cuda; default: cuda where there is a GPU.
+        num_envs: worlds of the training.
+        minutes: time of the whole training, without compiling kernels.
+        iterations: most iterations of the training; default: the recipe's.
+        seed: seed of the training and of the evaluations' starts.
+        episodes: episodes of each demonstration in each engine.
 
     Raises:
         XResetError: a step fails, or a file in the folder was made from others.
@@ -72,7 +73,8 @@ def run(
     out = Path(out)
     archive = read_demos(demos)
     spec = load_robot(robot)
-    engines = [each.name for each in quick_engines(engine, "cpu")]
+    named = [engine] if isinstance(engine, str) else engine
+    engines = [each.name for each in quick_engines(named, "cpu")]
     _show_times(len(archive.sequence_name), archive.num_frames, minutes, episodes, engines)
     motion = out / "motion.npz"
     bank = out / "resets.npz"
@@ -164,4 +166,4 @@ def _step(verb: str, *words: object, **options: object) -> None:
     perform(command)
 
 
-COMMAND = run
+COMMAND = verb(run)

@@ -9,20 +9,19 @@ simulated.
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from xreset.demos import hand
-from xreset.demos.archive import Demos, merge_demos, one_sequence
+from xreset.demos.archive import SIDES, Demos, merge_demos, one_sequence
 from xreset.demos.grasp import Contacts, Grasp, Solid, fit_hand, handedness, plan_contacts
 from xreset.errors import DemoError
-from xreset.files.checks import Seed, obeys_rules
-from xreset.files.progress import unseen
+from xreset.files.progress import Progress
 from xreset.geometry.shapes import turn_of
 from xreset.objects.catalogue import load_objects
 from xreset.objects.rest import rest_height, resting_orientation
@@ -61,54 +60,36 @@ _OPENING = np.array([0.0, 0.4, 0.2] * 4 + [-0.15, -0.1, 0.0, 0.3, 0.3])
 """[17] joint angles by which a hand opens before a grasp [rad]."""
 
 
-@obeys_rules
-def synthesize(
-    names: Iterable[str] | None = None,
-    per_object: int = 4,
-    seed: Seed = 0,
+def synthetic_demos(
+    names: Iterable[str] | None,
+    per_object: int,
+    seed: int,
     *,
-    fps: float = 30.0,
-    side: Literal["right", "left"] = "right",
-    meshes: str | Path | None = None,
-    progress: Callable[[float, int], None] = unseen,
+    fps: float,
+    sides: Sequence[str],
+    meshes: str | Path | None,
+    progress: Progress,
 ) -> Demos:
-    """Make synthetic demonstrations of the built-in stand-ins, or of the objects of a folder of meshes, which stand
-    with z up.
-
-    The same arguments give the same arrays, and a sequence does not depend on the other sequences.
-
-    Args:
-        names: names of objects, official or the paper's; None for all.
-        per_object: sequences of each object.
-        seed: chooses all that varies: place and heading of the object, grasp, paths, timing, goal pose.
-        fps: frames per second; a sequence lasts about 2.4 s.
-        side: the hand.
-        meshes: folder of real meshes; None for the stand-ins.
-        progress: called with (sequences done, sequences in all).
-
-    Raises:
-        ObjectError: unknown object.
-        DemoError: ``per_object`` or ``fps`` is out of range, the side is neither, or an object cannot be held.
-    """
+    """Return the demonstrations of :func:`xreset.demos.verbs.synthesize`, of one hand after another."""
     if not 1 <= per_object <= MAX_SEQUENCES or not 5 <= fps <= 1000:
         raise DemoError(
             f"per_object is {per_object} and fps is {fps}, expected 1 to {MAX_SEQUENCES} sequences and 5 to 1000"
             " frames per second."
         )
-    if side not in ("right", "left"):
-        raise DemoError(f"side is {side!r}, expected 'right' or 'left'.")
-    folder = Path(meshes) if meshes else None
-    specs = load_objects(names, folder)
+    if unknown := sorted(set(sides) - set(SIDES)):
+        raise DemoError(f"side is {unknown[0]!r}, expected 'right', 'left' or 'both'.")
+    specs = load_objects(names, Path(meshes) if meshes else None)
     parts = []
-    for spec in specs:
-        starts = [_start(spec, np.array(up), side) for up in _REST_UP.get(spec.name, (_Z,))]
-        for index in range(per_object):
-            name = f"{SUBJECT}/{spec.name}_{side}_{seed}_{index:03d}"
-            rng = np.random.default_rng(
-                [seed, index, zlib.crc32(spec.name.encode()), side == "left"]
-            )
-            parts.append(_sequence(spec, starts, name, side, fps, rng))
-            progress(len(parts), len(specs) * per_object)
+    for side in sides:
+        for spec in specs:
+            starts = [_start(spec, np.array(up), side) for up in _REST_UP.get(spec.name, (_Z,))]
+            for index in range(per_object):
+                name = f"{SUBJECT}/{spec.name}_{side}_{seed}_{index:03d}"
+                rng = np.random.default_rng(
+                    [seed, index, zlib.crc32(spec.name.encode()), side == "left"]
+                )
+                parts.append(_sequence(spec, starts, name, side, fps, rng))
+                progress(len(parts), len(specs) * per_object * len(sides))
     return merge_demos(parts)
 
 

@@ -13,13 +13,10 @@ from pathlib import Path
 import numpy as np
 
 from xreset.errors import ObjectError, needs
-from xreset.files.storage import atomic_folder
 from xreset.geometry.shapes import hull, loft, prism, section, shape_mesh
 from xreset.objects.properties import Properties
 from xreset.spec import Shape
 
-MOST = 10_000
-"""Most shapes of one folder."""
 _DENSITY = (150.0, 900.0)
 """Mass per volume [kg/m^3]: from a carton of cereal to a full can."""
 _MASS = (0.02, 1.0)
@@ -31,48 +28,24 @@ _CORNERS = 24
 """Points of a cross section."""
 
 
-def make_shapes(out: str | Path, count: int, seed: int = 0) -> list[Path]:
-    """Write random shapes as a folder of objects: ``NAME.obj`` and its mass in ``NAME.toml``.
-
-    The families take turns. The same seed gives the same shapes, and a shape does not depend on ``count``.
-
-    Args:
-        out: folder to make; it must not exist.
-        count: number of shapes.
-        seed: chooses sizes and masses.
-
-    Returns:
-        the meshes, in order.
-
-    Raises:
-        ObjectError: the folder exists, or ``count`` is out of range.
-    """
-    out = Path(out)
-    if not 1 <= count <= MOST:
-        raise ObjectError(f"count is {count}, expected a number from 1 to {MOST}.")
-    if out.exists():
-        raise ObjectError(f"{out} exists. Name a new folder.")
-    families = list(_FAMILIES)
-    with atomic_folder(out) as folder:
-        for number in range(count):
-            family = families[number % len(families)]
-            rng = np.random.default_rng([seed, number])
-            _write(folder / f"{family}_{number:04d}.obj", _FAMILIES[family](rng), rng)
-    return sorted(out.glob("*.obj"), key=lambda path: path.stem.rpartition("_")[2])
-
-
-def _write(path: Path, pieces: list[Shape], rng: np.random.Generator) -> None:
-    """Write the union of the pieces, and its mass."""
+def write_shape(folder: Path, number: int, seed: int) -> Path:
+    """Write one of the random shapes of a seed, the union of its pieces, and its mass; return the mesh."""
     import trimesh
 
     with needs("manifold3d", "objects", ObjectError):
         import manifold3d  # noqa: F401
+    families = list(_FAMILIES)
+    family = families[number % len(families)]
+    path = folder / f"{family}_{number:04d}.obj"
+    rng = np.random.default_rng([seed, number])
+    pieces = _FAMILIES[family](rng)
     mesh = trimesh.boolean.union([shape_mesh(piece) for piece in pieces], engine="manifold")
     mesh.apply_translation(-mesh.bounds.mean(axis=0))
     low, high = np.log(_DENSITY)
     mass = float(np.clip(mesh.volume * np.exp(rng.uniform(low, high)), *_MASS))
     mesh.export(path, digits=12)  # fewer would open seams
     path.with_suffix(".toml").write_text(Properties(mass=round(mass, 4)).to_toml())
+    return path
 
 
 # Families -------------------------------------------------------------------------------------------------------------

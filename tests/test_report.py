@@ -30,6 +30,7 @@ from xreset.eval.report.clips import (
     best_everywhere,
     camera_for,
     draw_clips,
+    draw_report,
     make_film,
     worst_episodes,
 )
@@ -41,6 +42,7 @@ from xreset.eval.results import read_evaluation, recorded, write_result
 from xreset.eval.table import table_text
 from xreset.eval.verbs import make_report
 from xreset.files.storage import claim_folder
+from xreset.geometry.description import load_robot
 from xreset.geometry.shapes import pose_matrix
 from xreset.learning.clock import Lift, Passing, write_lift
 from xreset.pictures.render import encode_mp4
@@ -345,6 +347,20 @@ class ClipTest(Reported):
         self.assertEqual(round(fps), 10)
         self.assertEqual(frames.shape[1] % 4, 0)
         return frames.shape[1] // 4 - 24
+
+    def test_runs_of_two_robots_are_drawn_each_with_its_own(self):
+        folders = []
+        for name in ("openarm", "ur7e-robotiq"):
+            robot = load_robot(name)
+            rollouts = toy_rollouts(np.array(robot.home))
+            self.write_results(name, rollouts, joints=robot.joint_names, robot=name)
+            folders.append(str(self.folder / name))
+        clips, strips = draw_report(read_trainings(folders), None, None)
+        runs = [clip.episode.run for clip in clips]
+        self.assertEqual((runs, strips), (["openarm", "ur7e-robotiq"], []))
+        shapes = {clip.frames.shape for clip in clips}
+        self.assertEqual(shapes, {(3, 300, 400, 3)})
+        self.assertTrue((clips[0].frames != clips[1].frames).any())
 
     def test_a_film_of_all_objects_in_all_engines(self):
         self.assertEqual(self.film_height(None), 150)

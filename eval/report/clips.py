@@ -230,10 +230,7 @@ def draw_report(
         shared = sorted(set.intersection(*engines))
         shown = shown[shown["engine"] == (shared[0] if shared else "")]
         shown = shown[shown["run"].isin([t.label for t in trainings[:MOST_FILMS]])]
-    first = trainings[0]
-    spec = load_robot(robot or first.robot)
-    folder = first.first.meshes_folder(meshes)
-    clips = draw_clips(best_everywhere(shown), spec, folder, first.vision)
+    clips = _draw_runs(best_everywhere(shown), trainings, robot, meshes)
     if not clips:
         raise XResetError(
             "no demonstration was recorded everywhere. Evaluate all engines in one command, and all runs with the same "
@@ -241,8 +238,28 @@ def draw_report(
         )
     if len(trainings) > 1:
         return clips, []
-    worst = worst_episodes(shown[shown["engine"] == first.first.engine], FAILURES)
-    return clips, draw_clips(worst, spec, folder, first.vision, strips=True)
+    worst = worst_episodes(shown[shown["engine"] == trainings[0].first.engine], FAILURES)
+    return clips, _draw_runs(worst, trainings, robot, meshes, strips=True)
+
+
+def _draw_runs(
+    episodes: Table,
+    trainings: Sequence[Training],
+    robot: str | None,
+    meshes: Path | None,
+    *,
+    strips: bool = False,
+) -> list[Clip]:
+    """Draw episodes as :func:`draw_clips`, each with the robot, the meshes and the cameras of its run."""
+    clips = []
+    for training in trainings:
+        own = episodes[episodes["run"] == training.label]
+        if own.empty:
+            continue
+        spec = load_robot(robot or training.robot)
+        folder = training.first.meshes_folder(meshes)
+        clips += draw_clips(own, spec, folder, training.vision, strips=strips)
+    return clips
 
 
 def recorded_in(trainings: Sequence[Training], robot: str | None) -> Table:
@@ -268,16 +285,13 @@ def make_film(
         RunError: no object was recorded everywhere.
         XResetError: the film cannot be encoded or written.
     """
-    first = trainings[0]
-    spec = load_robot(robot or first.robot)
-    folder = first.first.meshes_folder(meshes)
     columns = {}
     for name, own in recorded_in(trainings, robot).groupby("object"):
-        if clips := draw_clips(best_everywhere(own), spec, folder, first.vision):
+        if clips := _draw_runs(best_everywhere(own), trainings, robot, meshes):
             columns[str(name)] = clips
     if not columns:
         raise RunError(
-            f"no demonstration in {first.results_folder} was recorded in every engine. "
+            f"no demonstration in {trainings[0].results_folder} was recorded in every engine. "
             "Evaluate all engines in one command."
         )
     every = list(chain(*columns.values()))

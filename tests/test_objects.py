@@ -603,6 +603,27 @@ class RandomShapes(InFolder):
         self.assertEqual(made, sorted(path.name for path in nine[:2]))
         self.assertEqual((out / nine[1].name).read_bytes(), nine[1].read_bytes())
 
+    def test_a_built_in_object_joins_the_folder_as_a_mesh(self):
+        out = self.folder / "shapes"
+        make_shapes(out, 1)
+        succeeds("objects", "import", "scissors", "--out", out)
+        name = "037_scissors"
+        self.assertEqual(object_names(out), (name, "box_0000"))
+        built_in = load_object(name)
+        mesh = load_object(name, out)
+        self.assertAlmostEqual(mesh.mass, built_in.mass, places=4)
+        assert_allclose(bounding_box(mesh), bounding_box(built_in), atol=1e-6)
+        before = (out / f"{name}.obj").read_bytes()
+        for words, options in (
+            ("is there already", ("scissors", "--out", out)),
+            ("is a built-in object", ("soup", "--mass", 1, "--out", out)),
+            ("needs a folder of objects", ("soup",)),
+            ("There is no soupy. Expected", ("soupy", "--out", out)),
+        ):
+            with self.subTest(words):
+                self.assertIn(words, " ".join(refused("objects", "import", *options).split()))
+        self.assertEqual((out / f"{name}.obj").read_bytes(), before)
+
     def test_a_folder_is_never_overwritten(self):
         for words, folder, count in (
             ("exists. Name a new", self.folder, 1),

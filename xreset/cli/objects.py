@@ -47,12 +47,12 @@ def import_(
     """Cut a mesh, or every mesh of a folder, into convex pieces, and keep them for later runs.
 
     A mesh file goes into a folder of objects (--out), which other commands take as --meshes. NAME.toml in this folder
-    holds mass and friction.
+    holds mass and friction. The name of a built-in object puts it into such a folder as well.
 
     Args:
         path: A mesh file; or a folder with NAME.obj, NAME/textured_simple.obj or NAME/textured.obj, in metres, in the
-            frame of the object poses.
-        out: Folder of objects, for a mesh file.
+            frame of the object poses; or the name of a built-in object.
+        out: Folder of objects, for a mesh file or a built-in object.
         name: Name of the object in this folder; default: the name of the file.
         scale: Length of a unit of the file in metres: 0.001 for millimetres.
         mass: Mass in kg.
@@ -61,24 +61,37 @@ def import_(
         tolerance: Largest deviation of the pieces from the surface, in metres; default: 0.002.
         png: Picture to write: the meshes next to their pieces, with the deviation in millimetres.
     """
-    from xreset.objects import catalogue, meshes
+    from xreset.objects import catalogue, meshes, procedural
     from xreset.pictures import pieces, render
 
     try:
         properties = Properties(mass=mass, density=density, friction=friction, tolerance=tolerance)
     except ValueError as error:
         raise ObjectError(f"{error}.") from error
+    described = (name, scale, properties) != (None, 1.0, Properties())
+    built_in = catalogue.official_name(str(path))
     if path.is_dir():
-        if (out, name, scale, properties) != (None, None, 1.0, Properties()):
+        if out is not None or described:
             raise ObjectError(
                 f"{path} is a folder. --out, --name, --scale, --mass, --density, --friction and --tolerance are for one"
                 " mesh file. For a folder, write these properties into NAME.toml next to each mesh."
             )
         files = catalogue.mesh_files(path)
-    elif not path.exists():
-        raise ObjectError(f"There is no {path}. Expected a mesh file, or a folder of objects.")
+    elif not path.exists() and built_in not in catalogue.object_names():
+        raise ObjectError(
+            f"There is no {path}. Expected a mesh file, a folder of objects, or a built-in object (xreset objects)."
+        )
     elif out is None:
-        raise ObjectError("A mesh file needs a folder of objects to go into. Add --out.")
+        raise ObjectError(f"{path} needs a folder of objects to go into. Add --out.")
+    elif not path.exists():
+        if described:
+            raise ObjectError(
+                f"{path} is a built-in object. --name, --scale, --mass, --density, --friction and --tolerance are for "
+                "mesh files; edit NAME.toml in the folder instead."
+            )
+        written = procedural.write_stand_in(built_in, out)
+        out = None  # it is there
+        files = {built_in: written}
     else:
         files = {name or path.stem: path}
     table = [(*_HEAD, "mass from", "deviation, mm")]

@@ -7,15 +7,23 @@ z is up, the origin is the centre of the bounding box.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from xreset.errors import ObjectError, needs
+from xreset.files.storage import write_whole
 from xreset.geometry.shapes import hull, loft, prism, section, shape_mesh
+from xreset.objects.catalogue import canonical_name
 from xreset.objects.properties import Properties
+from xreset.objects.standins import stand_in
 from xreset.spec import Shape
+
+if TYPE_CHECKING:
+    import trimesh
 
 _DENSITY = (150.0, 900.0)
 """Mass per volume [kg/m^3]: from a carton of cereal to a full can."""
@@ -30,22 +38,56 @@ _CORNERS = 24
 
 def write_shape(folder: Path, number: int, seed: int) -> Path:
     """Write one of the random shapes of a seed, the union of its pieces, and its mass; return the mesh."""
-    import trimesh
-
-    with needs("manifold3d", "objects", ObjectError):
-        import manifold3d  # noqa: F401
     families = list(_FAMILIES)
     family = families[number % len(families)]
     path = folder / f"{family}_{number:04d}.obj"
     rng = np.random.default_rng([seed, number])
     pieces = _FAMILIES[family](rng)
-    mesh = trimesh.boolean.union([shape_mesh(piece) for piece in pieces], engine="manifold")
+    mesh = _union(pieces)
     mesh.apply_translation(-mesh.bounds.mean(axis=0))
     low, high = np.log(_DENSITY)
-    mass = float(np.clip(mesh.volume * np.exp(rng.uniform(low, high)), *_MASS))
-    mesh.export(path, digits=12)  # fewer would open seams
-    path.with_suffix(".toml").write_text(Properties(mass=round(mass, 4)).to_toml())
+    _write(path, mesh, float(np.clip(mesh.volume * np.exp(rng.uniform(low, high)), *_MASS)))
     return path
+
+
+def write_stand_in(name: str, folder: str | Path) -> Path:
+    """Write a built-in object as a mesh, and its mass, into a folder of objects, such as one of random shapes.
+
+    Args:
+        name: any of the object's names.
+        folder: folder of objects, which is made if there is none.
+
+    Returns:
+        the mesh.
+
+    Raises:
+        ObjectError: no built-in object has this name, or the folder has one of this name.
+    """
+    obj = stand_in(canonical_name(name))
+    path = Path(folder) / f"{obj.name}.obj"
+    for file in (path, path.with_suffix(".toml")):
+        if file.exists():
+            raise ObjectError(
+                f"{file} is there already. Nothing was changed; choose another --out."
+            )
+    _write(path, _union(obj.pieces), obj.mass)
+    return path
+
+
+def _union(pieces: Sequence[Shape]) -> trimesh.Trimesh:
+    import trimesh
+
+    with needs("manifold3d", "objects", ObjectError):
+        import manifold3d  # noqa: F401
+    return trimesh.boolean.union([shape_mesh(piece) for piece in pieces], engine="manifold")
+
+
+def _write(path: Path, mesh: trimesh.Trimesh, mass: float) -> None:
+    from trimesh.exchange.obj import export_obj
+
+    write_whole(path.with_suffix(".toml"), Properties(mass=round(mass, 4)).to_toml())
+    # fewer digits would open seams
+    write_whole(path, export_obj(mesh, digits=12))
 
 
 # Families -------------------------------------------------------------------------------------------------------------

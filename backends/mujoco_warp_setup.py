@@ -130,15 +130,31 @@ def compile_kernels(device: Any, launch: Callable[[], None]) -> int:
     """Compile the kernels that a function launches, on all cores, and return the number of their modules.
 
     Warp compiles a module when one of its kernels is launched first, one module after the other: for an H100 that is
-    188 s of one core. The longest module takes 36 s. So the function runs once without launching anything, to find the
-    modules. Loops on the device take one round, because nothing ends them.
+    188 s of one core. The longest module takes 36 s. So the function runs without launching anything, to find the
+    modules. It runs twice: some kernels are launched in blocks of the size that Warp suggests, which it does for
+    compiled kernels only.
     """
+    modules = set()
+    for is_compiled in (False, True):
+        found = _modules_launched(launch, is_compiled)
+        with ThreadPoolExecutor() as pool:
+            list(pool.map(lambda each: each[0].load(device, each[1]), found))
+        modules |= {module for module, _ in found}
+    return len(modules)
+
+
+def _modules_launched(
+    launch: Callable[[], None], is_compiled: bool
+) -> list[tuple[Any, int | None]]:
+    """Return the modules whose kernels a function launches, with the size of their blocks, without launching any. Loops
+    on the device take one round, because nothing ends them."""
     found: dict[tuple[Any, int | None], None] = {}
     this_thread = threading.get_ident()
     load = wp.Module.load
 
     def note(module: Any, device: Any, block_dim: int | None = None) -> Any:
-        if threading.get_ident() != this_thread:
+        is_suggesting = is_compiled and block_dim is None
+        if is_suggesting or threading.get_ident() != this_thread:
             return load(module, device, block_dim)
         found[module, block_dim] = None
         return None  # without a loaded module Warp launches nothing
@@ -146,11 +162,23 @@ def compile_kernels(device: Any, launch: Callable[[], None]) -> int:
     def take_one_round(_: Any, while_body: Callable[..., None], **arguments: Any) -> None:
         while_body(**arguments)
 
-    with patch.object(wp.Module, "load", note), patch.object(wp, "capture_while", take_one_round):
+    with (
+        patch.object(wp.Module, "load", note),
+        patch.object(wp, "capture_while", take_one_round),
+        patch.object(
+            wp,
+            "get_suggested_block_size",
+            wp.get_suggested_block_size if is_compiled else _usual_block_size,
+        ),
+    ):
         launch()
-    with ThreadPoolExecutor() as pool:
-        list(pool.map(lambda each: each[0].load(device, each[1]), found))
-    return len(found)
+    return list(found)
+
+
+def _usual_block_size(kernel: Any, device: Any = None) -> tuple[int, int]:
+    """Stand for Warp's function for a kernel that is not compiled yet: threads of a block, and blocks."""
+    kernel.module.load(device)
+    return 256, 1
 
 
 @contextmanager

@@ -319,6 +319,28 @@ class Kernels(TestCase):
             run()
         self.assertEqual(left.numpy()[0], 0)
 
+    def test_warp_suggests_block_sizes_for_compiled_kernels_only(self):
+        @wp.kernel(module="unique")
+        def clear(values: wp.array[int]):
+            values[wp.tid()] = 0
+
+        def suggest(kernel, device=None):
+            if kernel.module.load(device) is None:  # as on a GPU
+                raise RuntimeError("not compiled")
+            return 128, 1
+
+        def run():
+            size, _ = wp.get_suggested_block_size(clear, "cpu")
+            sizes.append(size)
+            wp.launch(clear, 4, [values], device="cpu", block_dim=size)
+
+        sizes = []
+        values = wp.ones(4, dtype=int, device="cpu")
+        with patch.object(wp, "get_suggested_block_size", suggest):
+            self.assertEqual(compile_kernels("cpu", run), 1)
+        self.assertEqual(sizes, [256, 128])
+        self.assertEqual(values.numpy().sum(), 4, "nothing is launched")
+
 
 class Limits(TestCase):
     def test_a_closed_backend_keeps_no_scene_alive(self):

@@ -103,7 +103,7 @@ class SequencePpo(PPO):
         self._worlds = torch.zeros(count // self.num_mini_batches, dtype=torch.long, device=device)
         self._graphs = GraphRunner(torch.device(device))
         # a graph needs minibatches of one size
-        self._graphs.active &= not self.is_multi_gpu and count % self.num_mini_batches == 0
+        self._graphs.active &= count % self.num_mini_batches == 0
 
     def process_env_step(
         self, obs: TensorDict, rewards: Tensor, dones: Tensor, extras: dict[str, Any]
@@ -130,7 +130,8 @@ class SequencePpo(PPO):
         """Learn from the rollout; return the mean losses of its minibatches.
 
         Unlike rsl-rl's, it reads no number from the device until the end: the adaptive learning rate is on the device,
-        too. On one GPU a minibatch is a CUDA graph, because its many small kernels take longer to launch than to run.
+        too. On a GPU a minibatch is a CUDA graph, in which gradients are averaged over processes, too: its many small
+        kernels take longer to launch than to run.
         """
         storage = self.storage
         if isinstance(self.critic, ReturnCritic):

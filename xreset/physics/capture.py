@@ -45,7 +45,8 @@ class GraphRunner:
             graph = torch.cuda.CUDAGraph()
             if self._generator is not None:
                 graph.register_generator_state(self._generator)
-            with torch.cuda.graph(graph, stream=self._stream):
+            # NCCL's watchdog asks for events in a thread of its own, which may not end a capture
+            with torch.cuda.graph(graph, stream=self._stream, capture_error_mode="thread_local"):
                 function()
             self._graphs[name] = graph
         self._graphs[name].replay()

@@ -21,8 +21,8 @@ from xreset.backends.conformance.scene import objects
 from xreset.backends.mjcf_model import OBJECT
 from xreset.backends.mujoco import MujocoBackend, MujocoWorld
 from xreset.backends.rigid import OTHER_LINK, TABLE, conjugate, rotate
-from xreset.cli import engines
 from xreset.errors import BackendUnavailableError, XResetError
+from xreset.eval.engines import contract
 from xreset.physics import KnownDifference
 
 Defect = type[MujocoWorld] | type[MujocoBackend]
@@ -602,9 +602,9 @@ class Harness(InFolder):
         errors = [("lift", torch.tensor(0.01)), ("turn", torch.tensor([0.0, -0.01204]))]
         measured, where = largest(iter(errors))
         failed = Measure(what="peak", measured=measured, tolerance=0.012, unit="rad", where=where)
-        self.assertEqual(engines._text(failed), "peak: 0.01204, tolerance 0.012 rad (turn)")
+        self.assertEqual(contract.shown(failed), "peak: 0.01204, tolerance 0.012 rad (turn)")
         passed = replace(failed, measured=0.0119)
-        self.assertEqual(engines._text(passed), "peak: 0.0119, tolerance 0.012 rad")
+        self.assertEqual(contract.shown(passed), "peak: 0.0119, tolerance 0.012 rad")
         with mock.patch.object(MujocoWorld, "set_object_gravity", lambda *_: None):
             [result] = run(partial(MujocoBackend, workers=0), only=["object_gravity"])
         self.assertIn(result.measures[0].where, {obj.name for obj in objects()})

@@ -1,44 +1,16 @@
-"""Types of arguments, and functions, that several commands share."""
+"""Functions that several commands share."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
-
-from tyro.conf import Positional, UseAppendAction, arg
+from typing import TYPE_CHECKING, Any
 
 from xreset.cli._terminal import console, show_table
-from xreset.files import checks
-from xreset.physics.plugins import Device as DeviceName
 from xreset.physics.plugins import backend_names, backend_status
 from xreset.retarget.accounts import Account, described
 
 if TYPE_CHECKING:
     from xreset.eval import rollout
-
-Source = Annotated[Path, Positional]
-"""A file or folder, given without a flag."""
-Several = Annotated[tuple[str, ...], UseAppendAction]
-"""A flag that may be given again. Its default must be empty, because values are appended to it."""
-
-
-# Options that several commands share, with their help -----------------------------------------------------------------
-
-Robot = Annotated[
-    str | None, arg(help="Name or folder of the robot; default: the policy's, or the file's.")
-]
-Meshes = Annotated[Path | None, arg(help="Folder of real meshes; default: the built-in stand-ins.")]
-AllEngines = Annotated[
-    Several,
-    arg(help="Physics engine; give it again for more. Default: all that can be used here."),
-]
-Device = Annotated[
-    DeviceName,
-    arg(help="Where engines run that can use a GPU: cpu or cuda; the others run on the CPU."),
-]
-Host = Annotated[str, arg(help="Address to serve at; 0.0.0.0 allows other machines.")]
-Port = Annotated[checks.Port, arg(help="Port to serve at; if it is taken, the next free one.")]
 
 
 def usable_engines() -> list[str]:

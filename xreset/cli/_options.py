@@ -7,7 +7,6 @@ import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, is_dataclass, replace
-from functools import partial
 from inspect import cleandoc, signature
 from pathlib import Path
 from shutil import get_terminal_size
@@ -32,12 +31,6 @@ _LONGEST = 1000
 """Largest number of characters of a text or a file name, because messages repeat them."""
 
 
-Output = Annotated[Path, Written()]
-"""File or folder that a command writes. It is claimed, and is no other path that the command gets."""
-Png = Annotated[Path, Written(".png")]
-Mp4 = Annotated[Path, Written(".mp4")]
-
-
 @dataclass(frozen=True)
 class _Option:
     """An option of a command, as it was given."""
@@ -59,9 +52,6 @@ class _Option:
 
 def checked(command: Callable[..., None]) -> Callable[..., None]:
     """Return the command with its options checked and its output files claimed while it runs."""
-    if isinstance(command, partial):
-        return partial(checked(command.func), **command.keywords)
-
     hints = get_type_hints(command, include_extras=True)
 
     def run(*positional: Any, **named: Any) -> None:
@@ -90,8 +80,6 @@ def checked(command: Callable[..., None]) -> Callable[..., None]:
 
 def description(command: Callable[..., None]) -> str:
     """Return what a command does."""
-    if isinstance(command, partial):
-        return description(command.func)
     return fitted(cleandoc(command.__doc__ or "").partition("\nArgs:\n")[0].strip())
 
 

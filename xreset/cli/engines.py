@@ -2,30 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Annotated, Any
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 from rich.text import Text
-from tyro.conf import arg
 
-from xreset.cli._common import (
-    AllEngines,
-    Device,
-    Several,
-    in_all_engines,
-    in_quick_engines,
-    usable_engines,
-)
-from xreset.cli._options import Output
+from xreset.cli._common import in_all_engines, in_quick_engines
 from xreset.cli._terminal import console, show_table
 from xreset.cli._verbs import verb
-from xreset.eval import verbs
-from xreset.files.storage import measured, write_json, write_whole
-from xreset.physics.plugins import backend_class, backend_names, backend_status, make_backend
-from xreset.spec import SceneSpec
+from xreset.eval.engines import verbs
+from xreset.physics.plugins import backend_names, backend_status
 
 if TYPE_CHECKING:
-    from xreset.backends import conformance
     from xreset.eval.engines.agreement import Parity
     from xreset.eval.engines.attribution import Attribution
     from xreset.eval.engines.replay import TraceResult
@@ -41,127 +29,17 @@ def list_() -> None:
     show_table(table)
 
 
-def check(
-    *,
-    engine: AllEngines = (),
-    robot: str | None = None,
-    device: Device = "cpu",
-    only: Annotated[Several, arg(name="check")] = (),
-    json: Output | None = None,
-    page: Output | None = None,
-    verbose: bool = False,
-) -> None:
-    """Test whether physics engines keep their contract. Exits with 1 if one does not.
-
-    Args:
-        robot: Name or folder of the robot to test with. Default: a gripper, with which every check can run.
-        only: Check to run; give it again for more. Default: all.
-        json: File to write the results to.
-        page: Markdown page to write, with a table of the results.
-        verbose: Show every measured number, not only the one nearest to its tolerance.
-    """
-    from xreset.backends import conformance
-    from xreset.eval.engines import page as pages
-    from xreset.geometry import description
-
-    spec = description.load_robot(robot) if robot else conformance.scene().robot
-    runs = []
-    failed = 0
-    for name in dict.fromkeys(engine) or usable_engines():
-        status = backend_status(name)
-        used = device if device.split(":")[0] in status.device else "cpu"
-        make = _maker(name, used)  # refuses an unknown engine, so it comes before the headline
-        what = f" {status.version}, {spec.name}, {used}: verdict, check, and what came nearest to its tolerance"
-        console.print(Text.assemble((name, "bold"), what))
-        results = conformance.run(
-            make, robot=spec, only=only or None, report=lambda result: _print_check(result, verbose)
-        )
-        runs.append(
-            {
-                "engine": name,
-                "engine_version": status.version,
-                "robot": spec.name,
-                "device": used,
-                "capabilities": sorted(backend_class(name).capabilities),
-                "seconds": round(sum(result.seconds for result in results), 3),
-                "checks": [result.as_dict() for result in results],
-            }
-        )
-        failed += sum(result.verdict == "failed" for result in results)
-    found = measured({"schema": conformance.SCHEMA, "runs": runs})
-    if json is not None:
-        write_json(json, found)
-        console.print(f"wrote {json}")
-    if page is not None:
-        write_whole(page, pages.page([found]))
-        console.print(f"wrote {page}")
-    if failed:
+def _show_checks(runs: Sequence[Mapping[str, Any]], options: Mapping[str, Any]) -> None:
+    for file in (options["json"], options["page"]):
+        if file:
+            console.print(f"wrote {file}")
+    verdicts = []
+    for run in runs:
+        verdicts += [check["verdict"] for check in run["checks"]]
+    if failed := verdicts.count("failed"):
         console.print(f"{failed} checks failed", style="bold red")
         raise SystemExit(1)
     console.print("no check failed", style="bold green")
-
-
-def _maker(name: str, device: str) -> conformance.MakeBackend:
-    """Return the function that makes worlds on a device.
-
-    The worlds that it makes first, which all checks share, run in processes of their own. Most others run in this one:
-    a new process takes longer to start than their check takes.
-    """
-    from xreset.backends import pool
-
-    pooled = issubclass(backend_class(name), pool.PoolBackend)
-    shared = True
-
-    def make(scene: SceneSpec, num_worlds: int, **chosen: Any) -> Any:
-        nonlocal shared
-        here = pooled and not shared and num_worlds <= 24
-        shared = False
-        options = {"workers": 0} if here else {}
-        return make_backend(name, scene, num_worlds, device=device, **chosen, **options)
-
-    return make
-
-
-_STYLE = {
-    "passed": "green",
-    "known difference": "cyan",
-    "failed": "bold red",
-    "unsupported": "yellow",
-    "skipped": "dim",
-}
-
-
-def _print_check(result: conformance.CheckResult, verbose: bool) -> None:
-    detail = _text(result.worst) if result.measures else result.problem
-    verdict = (f"{result.verdict:<16}", _STYLE[result.verdict])
-    console.print(
-        Text.assemble("  ", verdict, f" {result.name:<22} {result.seconds:5.1f} s  {detail}")
-    )
-    for measure in result.measures:
-        if verbose or measure.verdict != "passed":
-            console.print(f"{'':19}{measure.verdict}: {_text(measure)}")
-            if measure.verdict == "known difference" and measure.known is not None:
-                console.print(
-                    f"{'':19}accepted up to {measure.known.bound:.3g}: {measure.known.reason}"
-                )
-    if result.verdict == "failed":
-        console.print(f"{'':19}asserted: {result.check.statement}")
-        if result.problem:
-            console.print(f"{'':19}raised: {result.problem}")
-        console.print(f"{'':19}likely: {result.check.cause}")
-
-
-def _text(measure: conformance.Measure | None) -> str:
-    if measure is None:
-        return ""
-    digits = 2 if measure.verdict == "passed" else 3
-    measured, tolerance = (f"{x:.{digits}g}" for x in (measure.measured, measure.tolerance))
-    if measured == tolerance:  # show on which side it is
-        measured = f"{measure.measured:.6g}"
-    text = f"{measure.what}: {measured}, tolerance {tolerance} {measure.unit}".rstrip()
-    if measure.where and measure.verdict != "passed":
-        text += f" ({measure.where})"
-    return text
 
 
 def _show_agreement(found: Parity, options: Mapping[str, Any]) -> None:
@@ -236,7 +114,7 @@ def _show_attribution(found: Attribution, options: Mapping[str, Any]) -> None:
 
 COMMAND = {
     "": list_,
-    "check": check,
+    "check": verb(verbs.check_engines, _show_checks, prepare=in_all_engines, engines=()),
     "compare": verb(verbs.compare_engines, _show_agreement, prepare=in_quick_engines, engines=()),
     "trace": verb(verbs.trace_engines, _show_trace, prepare=in_all_engines, engines=()),
     "attribute": verb(verbs.attribute, _show_attribution),

@@ -27,11 +27,11 @@ _BANK_RATE = 5.0
 
 
 def load_view(
-    path: Path,
+    path: str | Path,
     *,
-    demos: Path | None = None,
-    robot: str | None = None,
-    meshes: Path | None = None,
+    demos: str | Path | None = None,
+    robot: str | Path | None = None,
+    meshes: str | Path | None = None,
 ) -> View:
     """Read demonstrations, robot trajectories, a reset bank or a goal set.
 

@@ -122,7 +122,7 @@ def read_recorded(
                     continue
                 episode["task"] = (task or TASK).replace("{object}", short_name(trace.object))
                 episode["action"] = action
-                episode["meshes"] = result.meshes_folder(Path(meshes) if meshes else None)
+                episode["meshes"] = result.meshes_folder(meshes)
                 rows.append(episode)
     if not rows:
         of = f" of {', '.join(wanted)}" if wanted else ""

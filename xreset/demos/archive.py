@@ -444,7 +444,7 @@ def write_demos(
     )
 
 
-def demo_objects(demos: Demos, meshes: Path | None = None) -> dict[str, ObjectSpec]:
+def demo_objects(demos: Demos, meshes: str | Path | None = None) -> dict[str, ObjectSpec]:
     """Return the objects of the demonstrations by name: stand-ins, or the meshes of a folder.
 
     Raises:

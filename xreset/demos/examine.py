@@ -164,9 +164,7 @@ def surfaces_of(demos: Demos, folder: str | Path | None) -> dict[str, Surface]:
     """
     if folder is None:
         return {}
-    return {
-        name: prepared_surface(spec) for name, spec in demo_objects(demos, Path(folder)).items()
-    }
+    return {name: prepared_surface(spec) for name, spec in demo_objects(demos, folder).items()}
 
 
 def refuse_wrong(found: Sequence[Finding], *, trust: bool) -> list[str]:

@@ -78,7 +78,7 @@ def synthetic_demos(
         )
     if unknown := sorted(set(sides) - set(SIDES)):
         raise DemoError(f"side is {unknown[0]!r}, expected 'right', 'left' or 'both'.")
-    specs = load_objects(names, Path(meshes) if meshes else None)
+    specs = load_objects(names, meshes)
     parts = []
     for side in sides:
         for spec in specs:

@@ -262,7 +262,7 @@ def _mirrored(demos: Demos, meshes: str | Path | None, say: Callable[[str], None
     from xreset.demos.archive import demo_objects
     from xreset.demos.mirror import TOLERANCE, mirrored, symmetry
 
-    objects = demo_objects(demos, Path(meshes) if meshes else None)
+    objects = demo_objects(demos, meshes)
     symmetries = {name: symmetry(spec) for name, spec in objects.items()}
     for name, found in sorted(symmetries.items()):
         verdict = "mirrored" if found.deviation <= TOLERANCE else "left out: not symmetric enough"

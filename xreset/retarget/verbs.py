@@ -79,7 +79,7 @@ def retarget_demos(
         inputs["demos"] = file_hash(demos)
         demos = read_demos(demos)
     if objects is None:
-        objects = tuple(demo_objects(demos, Path(meshes) if meshes else None).values())
+        objects = tuple(demo_objects(demos, meshes).values())
     objects = checked_objects(spec, objects)
     named = objects_named(objects, demos.object_names)
     surfaces = {name: prepared_surface(each) for name, each in named.items()}

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -28,19 +26,15 @@ class EngineDriver(Driver):
         self,
         env: ManipulationEnv,
         look: Callable[[], None] = lambda: None,
-        *,
-        real_time: bool = False,
     ) -> None:
         """Wrap worlds that were just reset.
 
         Args:
             env: the worlds.
             look: called after every control step.
-            real_time: whether the simulation runs no faster than the wall clock.
         """
         self.env = env
         self._look = look
-        self._begun = time.monotonic() if real_time else -math.inf
         self._substeps = 0
         self._target = env.joint_target.clone()
 
@@ -57,7 +51,6 @@ class EngineDriver(Driver):
             self._advance(count)
             self._substeps += count
             due -= count
-            time.sleep(max(0.0, self._begun + self.now() - time.monotonic()))
             if self._substeps % scene.substeps == 0:
                 self._look()
 

@@ -76,8 +76,6 @@ class FaultyDriver(EngineDriver):
         faults: Faults,
         seeds: Sequence[Sequence[int]],
         look: Callable[[], None] = lambda: None,
-        *,
-        real_time: bool = False,
     ) -> None:
         """Wrap worlds that were just reset.
 
@@ -86,9 +84,8 @@ class FaultyDriver(EngineDriver):
             faults: faults of all worlds.
             seeds: seed of each world's draws.
             look: called after every control step.
-            real_time: whether the simulation runs no faster than the wall clock.
         """
-        super().__init__(env, look, real_time=real_time)
+        super().__init__(env, look)
         scene = env.backend.scene
         self._dt = scene.control_dt
         steps = env.max_episode_length + 1

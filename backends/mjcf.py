@@ -14,7 +14,6 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import chain, combinations, product
-from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -123,68 +122,6 @@ def compile_scene(
         RobotError: the robot cannot be simulated.
         ObjectError: the object cannot be simulated.
     """
-    parts = _describe(scene, object_index, slots_for=slots_for, sensors=sensors)
-    spec = parts.spec
-    frames = parts.frames
-    model = _compiled(spec, scene, scene.objects[object_index])
-    geoms = [model.geom(i).name for i in range(model.ngeom)]
-    bodies = [model.body(body_name(body)).id for body in parts.robot.bodies]
-    joint_ids = [model.joint(name).id for name in parts.names]
-    free = model.joint("object").id
-    return SceneModel(
-        scene=scene,
-        model=model,
-        joints=MovingJoints(scene.robot, parts.names),
-        qpos=model.jnt_qposadr[joint_ids].astype(np.int64),
-        dof=model.jnt_dofadr[joint_ids].astype(np.int64),
-        link_body=np.array([bodies[i] for i in frames.bodies]),
-        link_pos=frames.pos,
-        link_quat=frames.quat,
-        moving_bodies=np.array(bodies[1:]),
-        object_body=model.body("object").id,
-        object_qpos=int(model.jnt_qposadr[free]),
-        object_dof=int(model.jnt_dofadr[free]),
-        geom_role=np.array([parts.roles.get(name, OBJECT) for name in geoms]),
-        parked=np.array([name in parts.parked for name in geoms]),
-        sensed_tip=np.array(parts.sensed, dtype=np.int64),
-    )
-
-
-def scene_xml(scene: SceneSpec, object_index: int) -> str:
-    """Return the model of :func:`compile_scene`, with sensors, as MJCF: for other builds of MuJoCo.
-
-    MJCF has fewer digits than the model, and MuJoCo puts the object's centre of mass elsewhere while it compiles
-    (:data:`_ASIDE`). Copy the arrays of the compiled model into the one that is made from the text.
-    """
-    spec = _describe(scene, object_index, sensors=True).spec
-    spec.compile()
-    return spec.to_xml()
-
-
-class _Description(NamedTuple):
-    """A scene before MuJoCo compiles it."""
-
-    spec: mujoco.MjSpec
-    robot: Mechanism
-    names: list[str]
-    """The actuated joints, then the mimic joints."""
-    frames: TrackedFrames
-    roles: dict[str, int]
-    """Geom -> role, without the object's own geoms."""
-    parked: set[str]
-    """Geoms that this object does not use."""
-    sensed: list[int]
-    """Fingertip of each geom that has a contact sensor."""
-
-
-def _describe(
-    scene: SceneSpec,
-    object_index: int,
-    *,
-    slots_for: Sequence[int] = (),
-    sensors: bool = False,
-) -> _Description:
-    """Describe a scene; arguments as for :func:`compile_scene`."""
     robot = mechanism(scene.robot)
     names = [*scene.robot.joint_names, *(mimic.joint for mimic in scene.robot.mimics)]
     spec = _empty_spec(scene)
@@ -200,17 +137,32 @@ def _describe(
     )
     roles["table"] = TABLE
     parked = _add_object(spec, scene, object_index, slots_for)
-    _add_drives(spec, scene, MovingJoints(scene.robot, names), names)
+    joints = MovingJoints(scene.robot, names)
+    _add_drives(spec, scene, joints, names)
     frames = TrackedFrames(robot)
     sensed = add_sensors(spec, robot, frames, roles) if sensors else []
-    return _Description(
+    model = _compiled(spec, scene, scene.objects[object_index])
+    geoms = [model.geom(i).name for i in range(model.ngeom)]
+    bodies = [model.body(body_name(body)).id for body in robot.bodies]
+    joint_ids = [model.joint(name).id for name in names]
+    free = model.joint("object").id
+    return SceneModel(
+        scene=scene,
         spec=spec,
-        robot=robot,
-        names=names,
-        frames=frames,
-        roles=roles,
-        parked=parked,
-        sensed=sensed,
+        model=model,
+        joints=joints,
+        qpos=model.jnt_qposadr[joint_ids].astype(np.int64),
+        dof=model.jnt_dofadr[joint_ids].astype(np.int64),
+        link_body=np.array([bodies[i] for i in frames.bodies]),
+        link_pos=frames.pos,
+        link_quat=frames.quat,
+        moving_bodies=np.array(bodies[1:]),
+        object_body=model.body("object").id,
+        object_qpos=int(model.jnt_qposadr[free]),
+        object_dof=int(model.jnt_dofadr[free]),
+        geom_role=np.array([roles.get(name, OBJECT) for name in geoms]),
+        parked=np.array([name in parked for name in geoms]),
+        sensed_tip=np.array(sensed, dtype=np.int64),
     )
 
 

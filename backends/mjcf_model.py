@@ -44,6 +44,9 @@ class SceneModel:
     """
 
     scene: SceneSpec
+    spec: mujoco.MjSpec
+    """What the model was compiled from, for other builds of MuJoCo. Its text has fewer digits than the model, and the
+    object's centre of mass is elsewhere in it: copy the arrays of the model into one that is made from the text."""
     model: mujoco.MjModel
     joints: MovingJoints
     """The actuated joints, then the mimic joints. Actuator i drives actuated joint i."""

@@ -5,7 +5,7 @@ FOLDER then has everything that the page needs, as static files:
 - the sources in ``docs/try``;
 - ``lib``: MuJoCo, onnxruntime and three.js from npm, in the versions of ``docs/try/package-lock.json``;
 - ``robot.json``: the robot's drawn meshes by MuJoCo body, the table, colors, and the names of all objects;
-- ``scenes/OBJECT.json``: MJCF of the robot with the object (:func:`~xreset.backends.mjcf.scene_xml`), the arrays of the
+- ``scenes/OBJECT.json``: MJCF of the robot with the object (:attr:`SceneModel.spec`), the arrays of the
   compiled model that the text does not give exactly, addresses of joints and sensors, and starts and goals;
 - ``policy.onnx``: the policy, from readings to joint targets (:mod:`xreset.live.graph`).
 """
@@ -24,7 +24,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from xreset.backends.mjcf import compile_scene, scene_xml
+from xreset.backends.mjcf import compile_scene
 from xreset.backends.mjcf_model import MOST_BRAKING, SceneModel, body_name
 from xreset.backends.rigid import mechanism
 from xreset.eval.play.session import Session
@@ -176,7 +176,7 @@ def body_poses(at: SceneModel) -> list[list[list[float]]]:
 def physics_part(scene: SceneSpec, object_index: int) -> dict[str, Any]:
     """Return what docs/try/physics.js needs of a scene with one of its objects."""
     at = compile_scene(scene, object_index, sensors=True)
-    xml = scene_xml(scene, object_index)
+    xml = at.spec.to_xml()
     robot = scene.robot
     return {
         "xml": xml,

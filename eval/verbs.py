@@ -380,7 +380,8 @@ def export_deploy(
         The folder.
 
     Raises:
-        PolicyError: the policy is a baseline or looks through cameras, or the folder is not empty.
+        PolicyError: the policy is a baseline or looks through cameras.
+        XResetError: the folder is not empty.
         ObjectError: there is neither a stand-in nor a mesh of an object.
     """
     from xreset.eval.policy_spec import load_policy

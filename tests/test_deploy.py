@@ -37,7 +37,7 @@ from xreset import (
     load_policy,
     synthesize,
 )
-from xreset.errors import PolicyError
+from xreset.errors import PolicyError, XResetError
 from xreset.eval.rollout import engine, episode_starts, load_trial, roll_out
 from xreset.live import cache
 from xreset.live.deploy import deployed_graph, with_objects, write_deployed
@@ -174,7 +174,7 @@ class ToyTest(InFolder):
         )
         self.assertEqual(np.shape(self.contract["objects"]["brick"]["points"]), (64, 3))
         self.assertTrue(set(shapes) <= set(self.contract["values"]))
-        with self.assertRaisesRegex(PolicyError, "exists already"):
+        with self.assertRaisesRegex(XResetError, "is there already"):
             write_deployed(b"", self.out)
         with self.assertRaisesRegex(LiveError, "has no object 'hat'. Choose from: brick"):
             self.controller.points("hat")

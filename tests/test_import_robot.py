@@ -18,7 +18,7 @@ from tests.data import DEFAULT, InFolder
 from tests.test_robots import BUILT_IN
 from tests.toy_robot import ROBOTS
 from xreset import load_object, load_robot, make_backend
-from xreset.errors import BackendUnavailableError, RobotError
+from xreset.errors import BackendUnavailableError, RobotError, XResetError
 from xreset.geometry.collision import table_clearance
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.urdf import load_urdf
@@ -750,7 +750,7 @@ class Toy(Robots):
         ):
             self.assertRaisesRegex(RobotError, words, self.imported, hand, **options)
         self.file("taken", "")
-        with self.assertRaisesRegex(RobotError, "is there already"):
+        with self.assertRaisesRegex(XResetError, "is there already"):
             make_robot(self.arm, self.hand, self.folder / "taken")
         self.assertEqual({path.name for path in self.folder.iterdir()}, {"hand.urdf", "taken"})
 

@@ -625,8 +625,11 @@ class RandomShapes(InFolder):
         self.assertEqual((out / f"{name}.obj").read_bytes(), before)
 
     def test_a_folder_is_never_overwritten(self):
+        taken = self.folder / "taken"
+        taken.mkdir()
+        (taken / "own.txt").touch()
         for words, folder, count in (
-            ("exists. Name a new", self.folder, 1),
+            ("is there already", taken, 1),
             ("count is 10001", self.folder / "none", 10_001),
         ):
-            self.assertRaisesRegex(ObjectError, words, make_shapes, folder, count)
+            self.assertRaisesRegex(XResetError, words, make_shapes, folder, count)

@@ -22,7 +22,7 @@ from xreset.eval.export.recorded import SCHEMA, RecordedEpisodes
 from xreset.eval.report.clips import draw_state, draw_view, policy_cameras
 from xreset.eval.results import Trace
 from xreset.files.progress import unseen
-from xreset.files.storage import atomic_folder, is_occupied, write_json
+from xreset.files.storage import atomic_folder, write_json
 from xreset.objects.catalogue import load_object
 from xreset.pictures.render import Renderer, Size, encode_mp4
 from xreset.spec import RobotSpec, SceneSpec
@@ -75,19 +75,12 @@ def write_lerobot(
             "Films of cameras are wanted and not wanted. Leave out --no-video or --camera."
         )
     videos = (VIDEO, *(_DEPTH + name for name in cameras)) if video else ()
-    if is_occupied(folder):
-        raise XResetError(f"{folder} is there already. Nothing was changed; choose another --out.")
     if video and (min(size) < 16 or size[0] % 2 or size[1] % 2):
         raise XResetError(
             f"films of {size[0]} x {size[1]} pixels cannot be encoded; width and height must be even, from 16 on."
         )
-    try:
-        with atomic_folder(folder) as part:
-            _write(part, recording, videos, size, progress)
-    except OSError as error:
-        raise XResetError(
-            f"cannot write {folder}: {error.strerror or error}. Nothing was changed; choose another place."
-        ) from error
+    with atomic_folder(folder) as part:
+        _write(part, recording, videos, size, progress)
 
 
 def _write(

@@ -79,13 +79,17 @@ def write_whole(path: str | Path, content: bytes | memoryview | str) -> None:
 def atomic_folder(path: Path) -> Iterator[Path]:
     """Make a temporary folder that becomes ``path`` when the block ends, and is removed if the block raises.
 
-    ``path`` must not exist, or be an empty folder. What killed processes have left next to it is removed.
+    What killed processes have left next to it is removed.
 
     Raises:
-        XResetError: the folder cannot be made or written.
+        XResetError: there is a file or a folder with content of this name, or the folder cannot be made or written.
     """
     path = Path(os.path.realpath(path))
     try:
+        if path.exists() and (not path.is_dir() or any(path.iterdir())):
+            raise XResetError(
+                f"{path} is there already. Nothing was changed; give another folder, or remove it."
+            )
         with _temporary(path.parent, Path.mkdir) as temporary:
             remove_leftovers(path.parent)
             try:
@@ -106,11 +110,6 @@ def _cannot_write(path: Path, error: OSError) -> XResetError:
     return XResetError(
         f"cannot write {path}: {reason}. Nothing was changed; free some space or choose another place."
     )
-
-
-def is_occupied(folder: Path) -> bool:
-    """Return whether there is a file of this name, or a folder that is not empty."""
-    return folder.exists() and (not folder.is_dir() or any(folder.iterdir()))
 
 
 @contextmanager

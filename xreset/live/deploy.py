@@ -13,7 +13,7 @@ import numpy as np
 
 from xreset import runtime
 from xreset.errors import PolicyError, needs
-from xreset.files.storage import atomic_folder, code_version, is_occupied
+from xreset.files.storage import atomic_folder, code_version
 from xreset.geometry.urdf import robot_tree
 from xreset.live import leapp
 from xreset.objects.sampling import center, surface_points
@@ -239,10 +239,8 @@ def write_deployed(graph: bytes, out: Path) -> None:
         out: folder to write; must not exist, or be empty.
 
     Raises:
-        PolicyError: the folder is not empty.
+        XResetError: the folder is not empty.
     """
-    if is_occupied(out):
-        raise PolicyError(f"{out} exists already. Choose another folder, or remove it.")
     with atomic_folder(out) as folder:
         (folder / POLICY).write_bytes(graph)
         (folder / leapp.FILE).write_text(leapp.leapp_description(graph))

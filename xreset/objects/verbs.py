@@ -26,7 +26,7 @@ def make_shapes(
     shapes, and a shape does not depend on the number of shapes.
 
     Args:
-        out: folder of objects to write; it must not exist.
+        out: folder of objects to make.
         count: number of shapes.
         seed: seed of sizes and masses.
 
@@ -34,15 +34,14 @@ def make_shapes(
         The meshes NAME.obj, in order; the mass of each is in NAME.toml.
 
     Raises:
-        ObjectError: the folder exists, or there are too many shapes.
+        ObjectError: there are too many shapes.
+        XResetError: the folder exists.
     """
     from xreset.objects.procedural import write_shape
 
     out = Path(out)
     if count > MOST:
         raise ObjectError(f"count is {count}, expected a number from 1 to {MOST}.")
-    if out.exists():
-        raise ObjectError(f"{out} exists. Name a new folder.")
     with atomic_folder(out) as folder:
         names = [write_shape(folder, number, seed).name for number in range(count)]
     return [out / name for name in names]

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from xreset.errors import RobotError
 from xreset.files.checks import frozen
-from xreset.files.storage import atomic_folder, is_occupied
+from xreset.files.storage import atomic_folder
 from xreset.files.text import listed
 from xreset.geometry.collision import SelfCollision
 from xreset.geometry.description import DESCRIPTION
@@ -98,8 +98,6 @@ def make_robot(
 ) -> Imported:
     """Make a robot's folder, without a picture: see :func:`xreset.robot_tools.verbs.import_robot`. The folder appears
     whole or not at all."""
-    if is_occupied(out):
-        raise RobotError(f"{out} is there already; give another folder, or remove it.")
     for option, values, most, unit in (
         ("--offset", offset, 1.0, "metres"),
         ("--rpy", rpy, 2 * np.pi, "radians"),

@@ -86,8 +86,9 @@ def import_robot(
         thumb: a link or joint of the thumb, if the import chooses another finger.
 
     Raises:
-        RobotError: a file cannot be read, the folder exists, no fingers are found, or the robot would fail its check;
-            the message says what to do.
+        RobotError: a file cannot be read, no fingers are found, or the robot would fail its check; the message says
+            what to do.
+        XResetError: the folder exists, or cannot be written.
     """
     from xreset.geometry.description import load_robot
     from xreset.pictures.render import write_png

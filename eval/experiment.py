@@ -21,6 +21,7 @@ from xreset.eval.results import (
     Trace,
     episode_table,
     read_result,
+    write_result,
 )
 from xreset.eval.rollout import Engine, Trial, roll_out
 from xreset.files.progress import Progress, unseen
@@ -37,25 +38,29 @@ def play(
     trial: Trial,
     engine: Engine,
     conditions: Sequence[Condition],
+    folder: Path,
     *,
     episodes: int,
     on_robot: bool = False,
+    measured: dict[str, float] | None = None,
+    left_out: dict[str, str] | None = None,
     progress: Progress = unseen,
-) -> tuple[EvalResult, tuple[Trace, ...]]:
-    """Play every demonstration under every condition in one engine.
+) -> EvalResult:
+    """Play every demonstration under every condition in one engine, and write the result and the recorded episodes; a
+    robot's control loop records none.
 
     Args:
         policy: the policy.
         trial: what is played; conditions replace its task.
         engine: the engine.
         conditions: the first one is recorded.
+        folder: where the result is written.
         episodes: episodes of each demonstration, each with another perturbation, the same under every condition.
         on_robot: whether a robot's control loop plays, as faults need.
+        measured: property -> what was measured of the engine.
+        left_out: property that has no condition -> why.
         progress: called with what is done and what is to be done in all; for one condition control steps, else
             conditions.
-
-    Returns:
-        The result, and the recorded episodes; none from the control loop of a robot.
     """
     tables = []
     stopped: Counter[str] = Counter()
@@ -106,10 +111,13 @@ def play(
         unseen=policy.unseen(trial.names),
         vision=vision if vision.cameras else None,
         episode_seconds=_length(trial),
+        left_out=left_out or {},
+        measured=measured or {},
         stopped=dict(stopped),
         episodes=pd.concat(tables, ignore_index=True),
     )
-    return result, traces
+    write_result(folder, result, traces, trial.robot.joint_names)
+    return result
 
 
 def _length(trial: Trial) -> float:

@@ -92,7 +92,7 @@ def evaluate(
     """
     from xreset.eval import experiment
     from xreset.eval.policy_spec import load_policy
-    from xreset.eval.results import Evaluation, write_result
+    from xreset.eval.results import Evaluation
     from xreset.eval.rollout import chosen_engines, load_trial
 
     spec = load_policy(policy, robot=robot, seed=seed)
@@ -114,11 +114,15 @@ def evaluate(
             [folder / f"{each.name}.json" for each in played_engines], trial
         )
         for each in played_engines:
-            nominal = [Condition(task=trial.task)]
-            result, traces = experiment.play(
-                spec, trial, each, nominal, episodes=episodes, progress=partial(progress, each.name)
+            result = experiment.play(
+                spec,
+                trial,
+                each,
+                [Condition(task=trial.task)],
+                folder,
+                episodes=episodes,
+                progress=partial(progress, each.name),
             )
-            write_result(folder, result, traces, trial.robot.joint_names)
             found.append(result)
     return found
 
@@ -176,7 +180,7 @@ def stress(
     from xreset.demos.verbs import synthesize
     from xreset.eval import experiment
     from xreset.eval.policy_spec import load_policy
-    from xreset.eval.results import Evaluation, write_result
+    from xreset.eval.results import Evaluation
     from xreset.eval.rollout import chosen_engines, load_trial
 
     on_robot = faults or any(prop.is_fault for prop in wanted)
@@ -211,17 +215,17 @@ def stress(
                     usable += own
                 else:
                     left_out[prop.option] = f"{each.name} cannot set it"
-            result, traces = experiment.play(
+            result = experiment.play(
                 spec,
                 trial,
                 each,
                 usable,
+                folder,
                 episodes=episodes,
                 on_robot=on_robot,
+                left_out=left_out,
                 progress=partial(progress, each.name),
             )
-            result = replace(result, left_out=left_out)
-            write_result(folder, result, traces, trial.robot.joint_names)
             found.append(result)
     return found
 

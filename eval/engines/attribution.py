@@ -22,7 +22,7 @@ from xreset.eval.engines.measure import measure
 from xreset.eval.experiment import can_set, play
 from xreset.eval.metrics import METRICS
 from xreset.eval.policy_spec import PolicySpec
-from xreset.eval.results import EvalResult, write_result
+from xreset.eval.results import EvalResult
 from xreset.eval.rollout import Engine, Trial, nominal_scene
 from xreset.eval.stats import Table, mean
 from xreset.files.checks import frozen
@@ -153,15 +153,22 @@ def attribute(
     results = []
     with claim_folder(out):
         for each, known, own in zip((a, b), measured, (conditions, conditions[:1]), strict=True):
-            result, traces = play(
-                policy, trial, each, own, episodes=episodes, progress=partial(progress, each.name)
-            )
             finite = {}
             for name, value in known.items():
                 if math.isfinite(value):
                     finite[COMPARED[name].option] = value
-            results.append(replace(result, measured=finite, left_out=left_out))
-            write_result(out, results[-1], traces, trial.robot.joint_names)
+            result = play(
+                policy,
+                trial,
+                each,
+                own,
+                out,
+                episodes=episodes,
+                measured=finite,
+                left_out=left_out,
+                progress=partial(progress, each.name),
+            )
+            results.append(result)
     return Attribution(a=results[0], b=results[1], folder=out)
 
 

@@ -20,10 +20,10 @@ from torch import Tensor
 
 from xreset.errors import DemoError
 from xreset.files.checks import frozen
-from xreset.geometry.kinematics import Kinematics
-from xreset.geometry.rotations import matrix_to_quat, quat_rotate_inverse
+from xreset.geometry.kinematics import Kinematics, on_host
+from xreset.geometry.rotations import matrix_to_quat
 from xreset.geometry.shapes import turn_of
-from xreset.geometry.surface import Surface
+from xreset.geometry.surface import prepared_surface
 from xreset.physics import State
 from xreset.physics.tensors import Tensors
 from xreset.resets.programs import least_squares, palm_path, pressing_targets
@@ -127,17 +127,10 @@ def _at_hand(motion: Retargeted, rows: np.ndarray, robot: RobotSpec, obj: Object
     rows = rows[motion.object_name[motion.sequence_of_frame[rows]] == obj.name]
     if not len(rows):
         return rows
-    links = robot.tracked_links[1:]
-    tips = Kinematics(robot).points(
-        torch.as_tensor(motion.joint_pos[rows], dtype=torch.float64), links
-    )
-    pos = torch.as_tensor(motion.object_pos[rows], dtype=torch.float64)[:, None]
-    quat = torch.as_tensor(motion.object_quat_wxyz[rows], dtype=torch.float64)[:, None]
-    local = quat_rotate_inverse(quat.expand(-1, len(links), -1), tips - pos)
-    points = local.flatten(0, 1)
-    only = torch.zeros(len(points), dtype=torch.long)
-    distance, _ = Surface(obj).field.signed_distance(points, only)
-    near = (distance < NEAR).view(len(rows), len(links)).numpy()
+    tips = on_host(robot).points(motion.joint_pos[rows].astype(float), robot.tracked_links[1:])
+    turn = turn_of(motion.object_quat_wxyz[rows]).as_matrix()
+    local = np.einsum("fji,fkj->fki", turn, tips - motion.object_pos[rows, None])
+    near = prepared_surface(obj).signed_distance(local) < NEAR
     return rows[near[:, 0] & near[:, 1:].any(axis=1)]
 
 

@@ -341,13 +341,8 @@ class MovingJoints:
 
     def spread(self, position: np.ndarray, velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return positions and velocities [D] of all moving joints, given those [J] of the actuated joints."""
-        q = np.zeros(self.count)
-        q[self.driven] = position
-        q[self.mimic] = self.multiplier * position[self.source] + self.offset
-        v = np.zeros(self.count)
-        v[self.driven] = velocity
-        v[self.mimic] = self.multiplier * velocity[self.source]
-        return q, v
+        matrix, offset = self.couplings
+        return matrix @ position + offset, matrix @ velocity
 
 
 def object_inertia(spec: ObjectSpec) -> Inertia:

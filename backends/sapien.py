@@ -105,7 +105,7 @@ class SapienWorld(World):
         pose = self._object.entity_pose
         self._quat = nearer(pose.q.astype(np.float64), self._quat)
         omega = self._object.angular_velocity.astype(np.float64)
-        position, velocity = self._joints.read()
+        position, velocity = self._joints.read(self._joints.driven)
         return {
             "joint_pos": position,
             "joint_vel": velocity,
@@ -131,7 +131,7 @@ class SapienWorld(World):
             self._system.step()
 
     def links(self) -> LinkArrays:
-        return self._tracked.locate(*self._joints.read_all())
+        return self._tracked.locate(*self._joints.read(self._joints.by_body))
 
     def contacts(self) -> list[tuple[int, np.ndarray]]:
         owners, points, forces = self._contact_points()

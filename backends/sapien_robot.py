@@ -22,8 +22,10 @@ class SapienJoints:
         self._articulation = articulation = links[0].articulation
         joints = {joint.name: joint for joint in articulation.active_joints}
         self._moving = moving = MovingJoints(spec, list(joints))
-        self._driven = moving.driven
-        self._by_body = [list(joints).index(name) for name in robot.joint_names]
+        self.driven = moving.driven
+        """[J] the actuated joints."""
+        self.by_body = [list(joints).index(name) for name in robot.joint_names]
+        """[D] the moving joints in the order of the bodies."""
         for joint in articulation.active_joints:
             joint.set_friction(0.0)
         for described in spec.joints:
@@ -54,16 +56,10 @@ class SapienJoints:
         self._articulation.qf = np.zeros(self._moving.count)
         self.set_targets(target)
 
-    def read(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return positions and velocities [J] of the actuated joints."""
-        position = self._articulation.qpos[self._driven]
-        velocity = self._articulation.qvel[self._driven]
-        return position.astype(np.float64), velocity.astype(np.float64)
-
-    def read_all(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return positions and velocities [D] of all moving joints, in the order of the bodies."""
-        position = self._articulation.qpos[self._by_body]
-        velocity = self._articulation.qvel[self._by_body]
+    def read(self, joints: Sequence[int] | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return positions and velocities of :attr:`driven` joints, or of all :attr:`by_body`."""
+        position = self._articulation.qpos[joints]
+        velocity = self._articulation.qvel[joints]
         return position.astype(np.float64), velocity.astype(np.float64)
 
     def set_drives(self, scale: np.ndarray) -> None:
@@ -91,13 +87,13 @@ class SapienJoints:
         """
         if not self._moving.has_dry_friction:
             return
-        position, velocity = self.read()
+        position, velocity = self.read(self.driven)
         drive = np.clip(
             self._kp * (self.target - position) - self._kd * velocity, -self._effort, self._effort
         )
         loss = self._moving.friction_loss
         torque = np.zeros(self._moving.count)
-        torque[self._driven] = np.clip(-self._inertia * velocity / self._dt - drive, -loss, loss)
+        torque[self.driven] = np.clip(-self._inertia * velocity / self._dt - drive, -loss, loss)
         self._articulation.qf = torque
 
 

@@ -13,6 +13,7 @@ from xreset.eval.conditions import Property, property_of
 from xreset.eval.plots import COLORS, svg
 from xreset.eval.results import EvalResult
 from xreset.eval.stats import Interval, Table, bootstrap_ci95, ci95, mean
+from xreset.eval.table import points_text
 from xreset.files.checks import frozen
 
 if TYPE_CHECKING:
@@ -54,8 +55,7 @@ class Effect:
 
     def difference_text(self) -> str:
         """Return the difference in points, and its interval."""
-        low, high = self.difference_ci95
-        return f"{100 * self.difference:+.1f} ({100 * low:+.1f} to {100 * high:+.1f})"
+        return points_text(self.difference, *self.difference_ci95)
 
 
 def effect(episodes: Table, nominal: Table, value: float = math.nan) -> Effect:

@@ -7,10 +7,9 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from xreset.errors import needs
 
@@ -31,8 +30,12 @@ def svg(draw: Callable[[Figure], None], size: tuple[float, float], salt: str) ->
         salt: keeps its identifiers apart from those of other figures on the page; the same salt and drawing give the
             same text.
     """
-    with figure_style({"svg.hashsalt": salt, "svg.fonttype": "none"}) as figure_class:
-        figure = figure_class(figsize=size, layout="constrained")
+    with needs("matplotlib", "eval"):
+        from matplotlib import style
+        from matplotlib.figure import Figure
+    own = {"svg.hashsalt": salt, "svg.fonttype": "none"}
+    with style.context([Path(__file__).with_name("project.mplstyle"), own]):
+        figure = Figure(figsize=size, layout="constrained")
         draw(figure)
         buffer = io.StringIO()
         figure.savefig(
@@ -47,13 +50,3 @@ def svg(draw: Callable[[Figure], None], size: tuple[float, float], salt: str) ->
     for attribute in ("width", "height"):
         text = re.sub(rf'(<svg[^>]*?) {attribute}="[^"]*"', r"\1", text, count=1)
     return text.strip()
-
-
-@contextmanager
-def figure_style(more: dict[str, Any]) -> Iterator[type[Figure]]:
-    """Yield matplotlib's ``Figure`` class; figures made in the block have the style of the project, and ``more``."""
-    with needs("matplotlib", "eval"):
-        from matplotlib import style
-        from matplotlib.figure import Figure
-    with style.context([Path(__file__).with_name("project.mplstyle"), more]):
-        yield Figure

@@ -45,6 +45,11 @@ def estimate_text(metric: str, mean: float, low: float, high: float) -> str:
     return f"{100 * mean:.1f} ({100 * low:.{digits}f}-{100 * high:.{digits}f})"
 
 
+def points_text(difference: float, low: float, high: float) -> str:
+    """Return a difference of shares and its interval in points, such as ``+5.2 (+1.0 to +9.3)``."""
+    return f"{100 * difference:+.1f} ({100 * low:+.1f} to {100 * high:+.1f})"
+
+
 def result_rows(results: Sequence[EvalResult]) -> list[tuple[str, ...]]:
     """Return one row of text for each metric: its name, then its value in each engine."""
     rows = [("version", *(r.engine_version for r in results))]

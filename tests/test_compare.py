@@ -9,6 +9,7 @@ from unittest import mock
 
 import numpy as np
 import pandas as pd
+from matplotlib.figure import Figure
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from torch.utils.tensorboard import SummaryWriter
@@ -19,7 +20,7 @@ from tests.toy_results import ENGINES, InFolder, rollouts_with, toy_episode, toy
 from xreset import TrainConfig
 from xreset.errors import FileFormatError, RunError, XResetError
 from xreset.eval.metrics import METRICS
-from xreset.eval.plots import COLORS, figure_style
+from xreset.eval.plots import COLORS
 from xreset.eval.report.curves import amounts, draw_lines, line
 from xreset.eval.report.groups import grouped, scores
 from xreset.eval.report.make import collect, page
@@ -598,9 +599,8 @@ class WrittenTest(Compared):
 
 class DrawTest(Compared):
     def draw(self, function, *arguments, **options):
-        with figure_style({}) as figure_class:
-            ax = figure_class().subplots()
-            function(ax, *arguments, **options)
+        ax = Figure().subplots()
+        function(ax, *arguments, **options)
         return ax
 
     def test_lines_and_bands(self):

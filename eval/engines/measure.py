@@ -25,6 +25,7 @@ from xreset.geometry.dynamics import drive_values, mass_matrix
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.shapes import hull, perpendicular, transformed
 from xreset.geometry.urdf import joint_limits, link_meshes
+from xreset.geometry.urdf_writer import axes
 from xreset.physics import State
 from xreset.spec import GRAVITY, ObjectSpec, SceneSpec, Shape
 
@@ -77,6 +78,8 @@ _TOP_HEIGHT = 0.04
 """Height of the top, a cone on its point [m]."""
 _TOP_RADIUS = 0.02
 """[m]"""
+_DIRECTIONS = 400
+"""Directions in which links are looked for that a paddle can press on."""
 _TOP_INERTIA = (1.0, 1.0, 1e-3)
 """Moments of inertia of the top [kg m^2]: it can hardly fall, and spins easily."""
 
@@ -191,10 +194,10 @@ class _Experiments:
             link_friction=self._pulled(log, "link"),
             table_friction=self._slid(log, step),
             torsional_friction=self._torsion(log),
-            arm_stiffness=_median(stiffness[arm]),
-            arm_damping=_median(damping[arm]),
-            hand_stiffness=_median(stiffness[hand]),
-            hand_damping=_median(damping[hand]),
+            arm_stiffness=float(np.median(stiffness[arm])),
+            arm_damping=float(np.median(damping[arm])),
+            hand_stiffness=float(np.median(stiffness[hand])),
+            hand_damping=float(np.median(damping[hand])),
             timestep=step,
         )
 
@@ -241,7 +244,8 @@ class _Experiments:
             pos[_AT[name], 2] = 0.6
         for name, (point, normal, _) in self._presses.items():
             pos[_AT[name]] = torch.as_tensor(point + (_SLAB_HALF[2] + 5e-4) * normal)
-            start.object_quat[_AT[name]] = torch.as_tensor(_z_to(normal))
+            turn = Rotation.from_matrix(axes(x=-perpendicular(normal), z=normal)[:3, :3])
+            start.object_quat[_AT[name]] = torch.as_tensor(turn.as_quat(scalar_first=True))
         start.object_linvel[_AT["slide"], 0] = _SPEED
         start.object_angvel[_AT["spin"], 2] = self._spin
         return start
@@ -309,7 +313,11 @@ def _reachable(scene: SceneSpec, *, tip: bool) -> tuple[np.ndarray, np.ndarray, 
         points[name in contact_links].append(transformed(mesh.vertices, T))
     mine = np.concatenate(points[tip])
     others = np.concatenate(points[not tip])
-    normals = _directions(400)
+    i = np.arange(_DIRECTIONS) + 0.5  # spread over the sphere in a Fibonacci lattice
+    normal_z = 1 - 2 * i / _DIRECTIONS
+    angle = np.pi * (1 + np.sqrt(5)) * i
+    flat = np.sqrt(1 - normal_z * normal_z)
+    normals = np.stack((flat * np.cos(angle), flat * np.sin(angle), normal_z), axis=1)
     reach = mine @ normals.T
     margin = reach.max(axis=0) - (others @ normals.T).max(axis=0)
     below = np.minimum(0.0, 2 * _SLAB_HALF[2] * normals[:, 2])
@@ -327,25 +335,3 @@ def _reachable(scene: SceneSpec, *, tip: bool) -> tuple[np.ndarray, np.ndarray, 
     if along[2] < 0:
         along = -along  # away from the table
     return mine[reach[:, best].argmax()], normal, along
-
-
-def _directions(count: int) -> np.ndarray:
-    """[count, 3] unit vectors spread over the sphere (a Fibonacci lattice)."""
-    i = np.arange(count) + 0.5
-    z = 1 - 2 * i / count
-    angle = np.pi * (1 + np.sqrt(5)) * i
-    r = np.sqrt(1 - z * z)
-    return np.stack((r * np.cos(angle), r * np.sin(angle), z), axis=1)
-
-
-def _z_to(direction: np.ndarray) -> np.ndarray:
-    """[4] rotation that turns z into a unit vector [3]."""
-    x = -perpendicular(direction)
-    return Rotation.from_matrix(np.stack((x, np.cross(direction, x), direction), axis=1)).as_quat(
-        scalar_first=True
-    )
-
-
-def _median(values: np.ndarray) -> float:
-    """Return the median; NaN without values."""
-    return float(np.median(values)) if len(values) else float("nan")

@@ -13,7 +13,7 @@ from xreset.eval.report.curves import AXES, X, amounts
 from xreset.eval.report.groups import EVERY, Groups, by_engine, certain_differences, counted
 from xreset.eval.report.read import Training, versions
 from xreset.eval.stats import Table
-from xreset.eval.table import Rows
+from xreset.eval.table import Rows, points_text
 from xreset.files.checks import frozen
 from xreset.learning.clock import SHARES, Lift
 
@@ -79,8 +79,7 @@ def results(groups: Groups, found: Table, above: Table) -> list[Row]:
                 )
             difference = ""
             if (label, engine) in more.index:
-                mean, low, high = more.loc[(label, engine), ["mean", "low", "high"]]
-                difference = f"{100 * mean:+.1f} ({100 * low:+.1f} to {100 * high:+.1f})"
+                difference = points_text(*more.loc[(label, engine), ["mean", "low", "high"]])
             row = Row(
                 label=label,
                 engine=engine,

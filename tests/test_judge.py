@@ -55,9 +55,7 @@ class Judge(InFolder):
         palm = kinematics.link_poses(home, ["palm"])[:, 0]
         for turn in (0.0, judging.TURN):
             with self.subTest(turn=turn):
-                path, error = judging.arm_path(
-                    kinematics, home, palm, rise=judging.HEIGHT, turn=turn
-                )
+                path, error = judging.arm_path(kinematics, home, palm, turn=turn)
                 self.assertLess(error, 1.0)
                 end = kinematics.link_poses(path[-1], ["palm"])[:, 0]
                 relative = torch.linalg.inv(palm[0]) @ end[0]

@@ -64,11 +64,6 @@ class DistanceFields(Tensors):
             nodes += len(part.values)
         return replace(DistanceFields.cat(parts), start=torch.cat(start))
 
-    def box_distance(self, points: Tensor, object_index: Tensor) -> Tensor:
-        """[...] distance of points [..., 3] from the bounding box of their object [...]; 0 inside."""
-        nearest = points.clamp(self.low[object_index], self.high[object_index])
-        return (points - nearest).norm(dim=-1)
-
     def nearer(
         self, points: Tensor, object_index: Tensor, limit: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
@@ -85,7 +80,8 @@ class DistanceFields(Tensors):
         Returns:
             Indices [A] of the near points, their signed distances [A] and gradients [A, 3].
         """
-        reachable = self.box_distance(points, object_index) <= (limit + self.spacing).clamp_min(0.0)
+        in_box = points.clamp(self.low[object_index], self.high[object_index])
+        reachable = (points - in_box).norm(dim=-1) <= (limit + self.spacing).clamp_min(0.0)
         candidates = reachable.nonzero()[:, 0]
         distance, gradient = self.signed_distance(points[candidates], object_index[candidates])
         near = distance < limit[candidates]

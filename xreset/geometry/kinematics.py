@@ -102,12 +102,8 @@ class _Chain(NamedTuple):
     """[m] rows of the moving joints' children."""
     axes: Tensor
     """[m, 3, 1] joint axes in the children's frames."""
-    turns: Tensor
-    """[m, 1] 1: a joint turns; 0: it slides."""
-    speeds: Tensor
-    """[m, J] speed of each moving joint, by the joints' speeds."""
-    carried: Tensor
-    """[links, m] 1: the joint moves the link; 0: it does not."""
+    movers: _Movers
+    """The moving joints."""
 
 
 def on_host(robot: RobotSpec) -> Any:
@@ -381,12 +377,14 @@ class Kinematics:
         T_links = T.index_select(1, chain.links)
         pos = T_links[..., :3, 3]
         T_joints = T.index_select(1, chain.joints)
-        moved = (T_joints[..., :3, :3] @ chain.axes)[..., 0] * (qd @ chain.speeds.T)[..., None]
-        turned = chain.turns * moved
-        angular = chain.carried @ turned
+        movers = chain.movers
+        rates = qd @ movers.coupling.T
+        moved = (T_joints[..., :3, :3] @ chain.axes)[..., 0] * rates[..., None]
+        turned = movers.turns * moved
+        angular = movers.carried @ turned
         # what each joint gives to the point of its links that is at the origin of the world
         at_origin = torch.linalg.cross(T_joints[..., :3, 3], turned) + moved - turned
-        linear = chain.carried @ at_origin + torch.linalg.cross(angular, pos)
+        linear = movers.carried @ at_origin + torch.linalg.cross(angular, pos)
         return pos, T_links[..., :3, :3], linear, angular
 
     def _chain_of(self, links: tuple[int, ...]) -> _Chain:
@@ -394,7 +392,8 @@ class Kinematics:
         chain = self._above[list(links)].any(axis=0).nonzero()[0].tolist()
         row_of = {link: row for row, link in enumerate(chain)}
         moving = {self._link_index[joint.child]: i for i, joint in enumerate(self._moving)}
-        joints = [link for link in chain if link in moving]
+        movers = self._moved(links)
+        joints = [self._moving[row] for row in movers.rows]
         fixed = np.tile(np.eye(4), (len(chain), 1, 1))
         change = np.zeros((len(chain), 3, 4, 4))
         coupling = self._coupling.new_zeros(len(chain), len(self.joint_names))
@@ -418,7 +417,6 @@ class Kinematics:
         while above.any():
             ancestors.append(self._indices(above))
             above = above[above]
-        types = [self.tree.above[self.link_names[link]] for link in joints]
         return _Chain(
             coupling=coupling,
             constant=constant,
@@ -426,11 +424,9 @@ class Kinematics:
             moving=self.array((fixed[:, None] @ change).reshape(len(chain), 3, 16)),
             ancestors=ancestors,
             links=self._indices([row_of[link] for link in links]),
-            joints=self._indices([row_of[link] for link in joints]),
-            axes=self.array([joint.axis for joint in types])[..., None],
-            turns=self.array([[joint.type == "revolute"] for joint in types]),
-            speeds=self._coupling[[moving[link] for link in joints]],
-            carried=self.array(self._above[np.ix_(links, joints)]),
+            joints=self._indices([row_of[self._link_index[joint.child]] for joint in joints]),
+            axes=self.array([joint.axis for joint in joints])[..., None],
+            movers=movers,
         )
 
     def _indices(self, values) -> Tensor:

@@ -29,7 +29,13 @@ from xreset.files.progress import Progress
 from xreset.files.records import Field, read_record, schema_of, write_record
 from xreset.geometry.shapes import quat_of, turn_of
 from xreset.objects.rest import rest_height, resting_orientation
-from xreset.resets.bank import ResetBank, bank_problem, check_objects, no_states
+from xreset.resets.bank import (
+    ResetBank,
+    bank_problem,
+    check_objects,
+    no_states,
+    stated_sources,
+)
 from xreset.resets.config import GoalConfig
 from xreset.spec import ObjectSpec, RobotSpec
 
@@ -166,8 +172,8 @@ def with_goals(bank: ResetBank, goals: GoalSet) -> ResetBank:
             f"The bank is for the robot {bank.robot!r}, and the goal set for {goals.robot!r} or another version of it. "
             f"Make the goal set again: xreset goals --robot {bank.robot}."
         )
-    sources = dict(zip(bank.object_names, bank.object_sources, strict=True))
-    for name, source in zip(goals.object_names, goals.object_sources, strict=True):
+    sources = stated_sources(bank)
+    for name, source in stated_sources(goals).items():
         if sources.setdefault(name, source) != source:
             raise FileFormatError(
                 f"The bank and the goal set were made with different meshes of {name}. Make one again."

@@ -20,7 +20,7 @@ from xreset.geometry.urdf import RobotTree
 from xreset.geometry.urdf_writer import FRAME_MASS, axes, fixed, frame
 from xreset.robot_tools.draft import draft_spec, link_places
 from xreset.robot_tools.opposition import closing_range, opposition
-from xreset.robot_tools.sources import with_fixed
+from xreset.robot_tools.sources import with_fixed, without
 from xreset.spec import FingertipSpec, KeypointSpec
 
 _FINGERS = ("index", "middle", "ring", "little")
@@ -104,7 +104,7 @@ class Hand:
             loose = self._loose_bodies(still)
             if loose:
                 notes.append(f"left out: what moves next to the hand: {', '.join(loose)}")
-                tree = _without(tree, loose)
+                tree = without(tree, loose)
                 names = [joint.name for joint in tree.joints]
                 still = [joint for joint in still if joint in names]
             if still:
@@ -244,7 +244,7 @@ class Hand:
                 self._notes.append(
                     f"left out, because {thumb} is of another hand: {', '.join(others)}"
                 )
-                return _without(tree, others)
+                return without(tree, others)
         raise RobotError(
             f"the file has {len(hands)} hands, with the fingers {'; '.join(tips)}. Choose one with --thumb, the name "
             "of a link of its thumb."
@@ -595,14 +595,6 @@ def _stated_finger(names: str) -> str:
         if re.search(rf"(?<![a-z])({words}|{code}{_BONE})", text):
             return finger
     return ""
-
-
-def _without(tree: RobotTree, children: Sequence[str]) -> RobotTree:
-    """Return a tree without some links and what they carry."""
-    removed = set().union(*map(tree.below, children))
-    links = tuple(link for link in tree.links if link.name not in removed)
-    joints = tuple(joint for joint in tree.joints if joint.child not in removed)
-    return replace(tree, links=links, joints=joints)
 
 
 def _keypoint_joints(finger: Finger) -> dict[str, int]:

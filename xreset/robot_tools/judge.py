@@ -267,9 +267,9 @@ def _play(kinematics: Kinematics, backend: Backend, start: State) -> Tensor:
     start = start.to("cpu").map(Tensor.double)
     joints = start.joint_pos
     palm = kinematics.link_poses(joints, [kinematics.robot.palm])[:, 0]
-    up, up_error = arm_path(kinematics, joints, palm, rise=HEIGHT, turn=0.0)
-    right, turn_error = arm_path(kinematics, up[-1], palm, rise=HEIGHT, turn=TURN)
-    left, left_error = arm_path(kinematics, up[-1], palm, rise=HEIGHT, turn=-TURN)
+    up, up_error = arm_path(kinematics, joints, palm, turn=0.0)
+    right, turn_error = arm_path(kinematics, up[-1], palm, turn=TURN)
+    left, left_error = arm_path(kinematics, up[-1], palm, turn=-TURN)
     turn = torch.where((turn_error <= left_error)[:, None], right, left)
     turn_error = turn_error.minimum(left_error)
     pos, quat = relative_pose(
@@ -297,15 +297,14 @@ def _play(kinematics: Kinematics, backend: Backend, start: State) -> Tensor:
 
 
 def arm_path(
-    kinematics: Kinematics, joints: Tensor, palm: Tensor, *, rise: float, turn: float
+    kinematics: Kinematics, joints: Tensor, palm: Tensor, *, turn: float
 ) -> tuple[Tensor, Tensor]:
-    """Move the palm up and turn it about its x axis.
+    """Move the palm up by :data:`HEIGHT` and turn it about its x axis.
 
     Args:
         kinematics: of the whole robot.
         joints: [N, J] where the path begins.
         palm: [N, 4, 4] pose from which the palm rises [m] and turns [rad].
-        rise: height at the end [m].
         turn: angle at the end [rad].
 
     Returns:
@@ -314,7 +313,7 @@ def arm_path(
     risen = kinematics.link_poses(joints, [kinematics.robot.palm])[:, 0, 2, 3] - palm[:, 2, 3]
     share = torch.linspace(0.0, 1.0, 1 + _WAYPOINTS, dtype=joints.dtype)[1:, None]
     pos = palm[:, :3, 3].repeat(_WAYPOINTS, 1, 1)
-    pos[..., 2] += risen + share * (rise - risen)
+    pos[..., 2] += risen + share * (HEIGHT - risen)
     axis = torch.nn.functional.pad(share * turn, (0, 2))  # about x
     start = matrix_to_quat(palm[:, :3, :3]).expand(_WAYPOINTS, -1, -1)
     turned = quat_multiply(start, quat_from_axis_angle(axis)[:, None].expand_as(start))

@@ -4,7 +4,7 @@ together."""
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from xml.etree.ElementTree import Element
@@ -140,10 +140,7 @@ def bare(arm: RobotTree, flange: str, notes: list[str]) -> RobotTree:
         notes.append(
             f"joints of the arm that do not move the hand are fixed at 0: {', '.join(stiff)}"
         )
-    arm = with_fixed(arm, stiff)
-    joints = tuple(joint for joint in arm.joints if joint.child not in removed)
-    links = tuple(link for link in arm.links if link.name not in removed)
-    return replace(arm, links=links, joints=joints)
+    return without(with_fixed(arm, stiff), removed)
 
 
 def grounded(hand: RobotTree, notes: list[str]) -> RobotTree:
@@ -175,6 +172,14 @@ def _moving_ends(tree: RobotTree, link: str) -> list[str]:
         for name in inside
         if name in tree.moved_by and not tree.moved_by.keys() & set(tree.below(name)[1:])
     ]
+
+
+def without(tree: RobotTree, children: Iterable[str]) -> RobotTree:
+    """Return a tree without some links and what they carry."""
+    removed = set().union(*map(tree.below, children))
+    links = tuple(link for link in tree.links if link.name not in removed)
+    joints = tuple(joint for joint in tree.joints if joint.child not in removed)
+    return replace(tree, links=links, joints=joints)
 
 
 def with_fixed(tree: RobotTree, names: Sequence[str]) -> RobotTree:

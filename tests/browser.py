@@ -9,12 +9,12 @@ import subprocess
 import tempfile
 import time
 import urllib.request
-from importlib.util import find_spec
 from pathlib import Path
 from unittest import SkipTest
 
 import numpy as np
 from PIL import Image
+from websockets.sync.client import connect
 
 _NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
 _FLAGS = (
@@ -32,12 +32,10 @@ _KEYS = {"ArrowRight": 39, "End": 35}
 
 
 def find_chromium():
-    """The browser's program; skips the test where there is none, or nothing to talk to it with."""
+    """The browser's program; skips the test where there is none."""
     program = next(filter(None, map(shutil.which, _NAMES)), None)
     if program is None:
         raise SkipTest(f"no Chromium here (looked for {', '.join(_NAMES)})")
-    if not find_spec("websockets"):
-        raise SkipTest("websockets is not installed (it comes with viser)")
     return program
 
 
@@ -45,8 +43,6 @@ class Browser:
     """One tab. ``problems`` collects console errors and exceptions of its pages."""
 
     def __init__(self, program):
-        from websockets.sync.client import connect
-
         self.problems: list[str] = []
         self._profile = tempfile.TemporaryDirectory(
             prefix="xreset-chromium-", ignore_cleanup_errors=True

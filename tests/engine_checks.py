@@ -9,6 +9,7 @@ from unittest import mock
 import numpy as np
 import torch
 from torch import tensor
+from torch.testing import assert_close
 
 from xreset.backends.conformance.grasp_checks import grasp
 from xreset.backends.conformance.harness import Bench
@@ -77,7 +78,7 @@ class EngineChecks:
         )
         force = (backend.contacts().tip_force[0] @ along).abs()
         # Both forces are equal, because the brick does not move: F + 1.1 F = drive.
-        torch.testing.assert_close(force, torch.full((2,), drive / 2.1), rtol=0.03, atol=0.0)
+        assert_close(force, torch.full((2,), drive / 2.1), rtol=0.03, atol=0.0)
 
     # Contacts ---------------------------------------------------------------------------------------------------------
 

@@ -3,13 +3,14 @@
 import shutil
 from dataclasses import replace
 from itertools import product
-from unittest import SkipTest, TestCase
+from unittest import TestCase
 from unittest.mock import patch
 
 import numpy as np
 import torch
 from numpy.testing import assert_allclose
 from torch import tensor
+from torch.testing import assert_close
 
 from tests.command import succeeds, xreset
 from tests.data import InFolder
@@ -24,14 +25,9 @@ from xreset.retarget.arm.config import ArmSearch
 from xreset.retarget.arm.model import ArmModel, ArmTargets
 from xreset.retarget.arm.solve import splice, spread_over, track
 from xreset.retarget.validity import Thresholds, classify
+from xreset.robot_tools import place as placing
 from xreset.robot_tools.placement import Finalist, PlaceConfig, write_placement
 
-try:
-    from xreset.robot_tools import place as placing
-except ImportError as error:
-    raise SkipTest(str(error)) from error
-
-assert_close = torch.testing.assert_close
 CONFIG = PlaceConfig(x=(0.2, 0.7), y=(0.4, 0.8), z=(0.4, 0.7), rounds=2)
 NOWHERE = np.zeros((0, 3))
 

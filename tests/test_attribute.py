@@ -6,6 +6,7 @@ from unittest import TestCase
 from unittest.mock import patch
 
 import torch
+from torch.testing import assert_close
 
 from tests import toy_grasp
 from tests.command import printed, refused, succeeds
@@ -145,7 +146,7 @@ class ChangeTest(TestCase):
             found = pair_friction(torch.tensor([0.9]), self.drawn(name, 0.45, 0.5))[0]
             expected = pair_friction(torch.tensor([0.9]), self.TASK.randomization)[0]
             expected[pair] *= 0.9
-            torch.testing.assert_close(found, expected)
+            assert_close(found, expected)
         self.assertEqual(self.drawn("hand damping", 1.5).hand_damping, (1.5, 1.5))
         self.assertEqual(self.drawn("torsional friction", 0.0).torsional_friction, (0.0, 0.0))
         finer = self.change("timestep", 1 / 480)

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 import warp as wp
 from mujoco_warp._src import constraint
+from numpy.testing import assert_allclose, assert_array_equal
 from torch import tensor
 from torch.testing import assert_close
 
@@ -80,7 +81,7 @@ class Model(InFolder):
         data.qpos[at.qpos], _ = at.joints.spread(q, np.zeros_like(q))
         data.ctrl[:] = q + off
         mujoco.mj_forward(at.model, data)
-        np.testing.assert_allclose(
+        assert_allclose(
             data.actuator_force, off * [joint.drive.kp for joint in robot.joints], atol=1e-9
         )
 
@@ -145,7 +146,7 @@ class Model(InFolder):
         )
         for field in same:
             for other in models[1:]:
-                np.testing.assert_array_equal(
+                assert_array_equal(
                     getattr(models[0].model, field), getattr(other.model, field), field
                 )
         expected = {

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 from unittest import TestCase
 
 import numpy as np
+from numpy.testing import assert_allclose
 
 from tests.engine_checks import EngineChecks
 from xreset.backends.conformance import run
@@ -102,4 +103,4 @@ class FrictionTest(TestCase):
         torque = np.cross(arms, tangential).sum(0)
         found = friction_forces(arms, normals, np.full(3, 0.8), force, torque)
         # three contacts: six unknowns, six equations
-        np.testing.assert_allclose(found, tangential, atol=1e-6)
+        assert_allclose(found, tangential, atol=1e-6)

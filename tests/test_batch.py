@@ -4,6 +4,8 @@ import unittest
 
 import numpy as np
 import torch
+from numpy.testing import assert_allclose
+from torch.testing import assert_close
 
 from xreset.backends.batch import BatchBackend, LinkFrames, sum_contacts
 from xreset.backends.conformance.scene import gripper, scene
@@ -76,7 +78,7 @@ class BatchTest(unittest.TestCase):
                 given = given / given.norm(dim=-1, keepdim=True)
             expected = getattr(before, name).clone()
             expected[[3, 1]] = given
-            torch.testing.assert_close(value, expected, atol=0, rtol=0)
+            assert_close(value, expected, atol=0, rtol=0)
         self.assertEqual(backend.applied[-1], [False, True, False, True])
         self.assertEqual(backend.health().nonfinite.tolist(), [True, False, True, False])
         self.assertEqual(
@@ -95,9 +97,9 @@ class BatchTest(unittest.TestCase):
         other.set_object_mass(mass[rows], rows)
         other.set_state(new[rows], rows)
         for name, value in vars(self.backend.state()).items():
-            torch.testing.assert_close(value, getattr(other.state(), name), atol=0, rtol=0)
+            assert_close(value, getattr(other.state(), name), atol=0, rtol=0)
         found = self.backend.object_properties().mass
-        torch.testing.assert_close(found, other.object_properties().mass, atol=0, rtol=0)
+        assert_close(found, other.object_properties().mass, atol=0, rtol=0)
 
     def test_what_it_cannot_do_and_wrong_shapes_are_refused(self):
         with self.assertRaisesRegex(CapabilityError, "friction"):
@@ -122,10 +124,10 @@ class BatchTest(unittest.TestCase):
             expected = nominal.changed(
                 mass=float(mass[i]), scale=float(scale[i]), offset=offset[i].numpy()
             )
-            np.testing.assert_allclose(found.com[i], expected.com, atol=1e-7)
-            np.testing.assert_allclose(found.inertia[i], expected.matrix, rtol=1e-5, atol=1e-10)
+            assert_allclose(found.com[i], expected.com, atol=1e-7)
+            assert_allclose(found.inertia[i], expected.matrix, rtol=1e-5, atol=1e-10)
         weight = -GRAVITY * mass * torch.tensor([0.0, 0.5, 1.0, 1.0])
-        torch.testing.assert_close(self.backend.object_load()[:, 2], weight)
+        assert_close(self.backend.object_load()[:, 2], weight)
 
 
 class ReadingsTest(unittest.TestCase):
@@ -146,7 +148,7 @@ class ReadingsTest(unittest.TestCase):
             for name, value in zip(
                 ("tip_force", "tip_touch", "table_force"), expected, strict=True
             ):
-                np.testing.assert_allclose(getattr(contacts, name)[i], value, atol=1e-5)
+                assert_allclose(getattr(contacts, name)[i], value, atol=1e-5)
 
     def test_a_contact_without_force_is_no_touch(self):
         _, contacts, _ = no_readings(gripper(), 2)
@@ -166,7 +168,7 @@ class ReadingsTest(unittest.TestCase):
         for i in range(5):
             expected = frames.locate(*(x[i].double().numpy() for x in (pos, quat, velocity, spin)))
             for name, value in zip(("pos", "quat", "linvel", "angvel"), expected, strict=True):
-                np.testing.assert_allclose(getattr(links, name)[i], value, atol=1e-5)
+                assert_allclose(getattr(links, name)[i], value, atol=1e-5)
 
     def test_couplings_spread_joints(self):
         robot = mechanism(gripper())
@@ -174,8 +176,8 @@ class ReadingsTest(unittest.TestCase):
         matrix, offset = joints.couplings
         position, velocity = np.random.default_rng(1).normal(size=(2, len(gripper().joints)))
         expected = joints.spread(position, velocity)
-        np.testing.assert_allclose(matrix @ position + offset, expected[0])
-        np.testing.assert_allclose(matrix @ velocity, expected[1])
+        assert_allclose(matrix @ position + offset, expected[0])
+        assert_allclose(matrix @ velocity, expected[1])
         self.assertNotEqual(len(matrix), len(position))  # a mimic joint follows
 
 

@@ -2,29 +2,26 @@
 
 from dataclasses import replace
 from functools import partial
-from unittest import SkipTest, TestCase, mock
+from unittest import TestCase, mock
 
 import numpy as np
 import torch
 import trimesh
+from numpy.testing import assert_array_equal
 from torch import tensor
 from torch.testing import assert_close
 
 from tests.toy_bank import SOUP, toy_bank
 from tests.toy_robot import toy_robot
 from xreset.cameras.config import CameraConfig, DepthNoise, VisionConfig
+from xreset.cameras.rays import RayCaster
+from xreset.cameras.sensor import Cameras
 from xreset.env.manipulation import make_env, make_scene
 from xreset.errors import RobotError, XResetError
 from xreset.objects.catalogue import load_objects
 from xreset.physics import State
 from xreset.physics.plugins import make_backend
 from xreset.task.config import ObservationConfig, RandomizationConfig, TaskConfig, evaluation_task
-
-try:
-    from xreset.cameras.rays import RayCaster
-    from xreset.cameras.sensor import Cameras
-except XResetError as error:
-    raise SkipTest(str(error)) from error
 
 IDEAL = DepthNoise(spread=0.0, step=0.0, holes=0.0, edges=0.0)
 ABOVE = CameraConfig(pos=(0.57, 0.3, 0.5), target=(0.57, 0.3, 0.0), noise=IDEAL)
@@ -138,7 +135,7 @@ class TestCameras(TestCase):
         self.assertTrue((gray == gray[..., :1]).all())
         green = colored[..., 1] > colored[..., 0]
         self.assertTrue(green[:, :64].any() and green[:, 64:].any())
-        np.testing.assert_array_equal(colored[~green], gray[~green])
+        assert_array_equal(colored[~green], gray[~green])
 
     def test_a_camera_on_a_link_moves_with_it(self):
         cameras = self.cameras(

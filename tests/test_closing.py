@@ -2,8 +2,7 @@
 
 import json
 from dataclasses import replace
-from importlib.util import find_spec
-from unittest import TestCase, skipUnless
+from unittest import TestCase
 from unittest.mock import patch
 
 import numpy as np
@@ -301,7 +300,6 @@ PLAIN = (
 """Options for a bank of frames that do not press."""
 
 
-@skipUnless(find_spec("mujoco"), "MuJoCo is not installed")
 class CommandTest(InFolder):
     def setUp(self):
         super().setUp()

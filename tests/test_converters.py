@@ -14,6 +14,7 @@ import numpy as np
 import scipy.sparse
 import torch
 import trimesh
+from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 import xreset
@@ -96,15 +97,15 @@ class ManoTest(TestCase):
 
     def test_the_hand_at_rest_is_where_its_shape_says(self):
         found = points_of(self.model, np.zeros((16, 3)), ORIGIN)
-        np.testing.assert_allclose(found, self.rest + ORIGIN, atol=1e-12)
+        assert_allclose(found, self.rest + ORIGIN, atol=1e-12)
         found = points_of(self.model, np.zeros((16, 3)), ORIGIN, wrist_at_trans=True)
-        np.testing.assert_allclose(found, self.rest - self.rest[0] + ORIGIN, atol=1e-12)
+        assert_allclose(found, self.rest - self.rest[0] + ORIGIN, atol=1e-12)
 
     def test_the_root_turns_everything_about_the_wrist(self):
         pose = np.zeros((16, 3))
         pose[0] = 0.3, -0.2, 0.5
         turned = Rotation.from_rotvec(pose[0]).apply(self.rest - self.rest[0]) + self.rest[0]
-        np.testing.assert_allclose(points_of(self.model, pose), turned, atol=1e-12)
+        assert_allclose(points_of(self.model, pose), turned, atol=1e-12)
 
     def test_a_joint_turns_what_comes_after_it(self):
         pose = np.zeros((16, 3))
@@ -112,23 +113,21 @@ class ManoTest(TestCase):
         found = points_of(self.model | {"posedirs": np.zeros((778, 3, 135))}, pose)
         after = [3, 17]  # the index finger's last joint and its tip
         turned = Rotation.from_rotvec(pose[2]).apply(self.rest[after] - self.rest[2]) + self.rest[2]
-        np.testing.assert_allclose(found[after], turned, atol=1e-12)
+        assert_allclose(found[after], turned, atol=1e-12)
         others = [point for point in range(21) if point not in after]
-        np.testing.assert_allclose(found[others], self.rest[others], atol=1e-12)
+        assert_allclose(found[others], self.rest[others], atol=1e-12)
 
     def test_the_pose_corrects_the_skin_of_the_tips(self):
         pose = np.zeros((16, 3))
         pose[13] = 0.4, 0.0, 0.0  # the thumb, of which the index finger's tip is no part
         change = Rotation.from_rotvec(pose[13]).as_matrix() - np.eye(3)
         expected = self.model["posedirs"][mano.TIPS[1]][:, 9 * 12 : 9 * 13] @ change.ravel()
-        np.testing.assert_allclose(
-            points_of(self.model, pose)[17] - self.rest[17], expected, atol=1e-12
-        )
+        assert_allclose(points_of(self.model, pose)[17] - self.rest[17], expected, atol=1e-12)
 
     def test_angles_may_be_relative_to_the_mean_hand(self):
         pose = np.vstack((np.zeros(3), -self.model["hands_mean"].reshape(15, 3)))
         found = points_of(self.model, pose, relative_to_mean=True)
-        np.testing.assert_allclose(found, self.rest, atol=1e-12)
+        assert_allclose(found, self.rest, atol=1e-12)
 
 
 class Scene:
@@ -219,10 +218,8 @@ class ConverterTest(InFolder):
         order = said.getvalue().partition("--order ")[2].split()[0]
         written = dict(np.load(out))
         points = written["keypoints"][:, ORDERS[order]]
-        np.testing.assert_allclose(
-            scene.relative(points, written["object_pose"]), scene.in_object, atol=1e-5
-        )
-        np.testing.assert_allclose(points[..., 2], scene.heights, atol=1e-4)
+        assert_allclose(scene.relative(points, written["object_pose"]), scene.in_object, atol=1e-5)
+        assert_allclose(points[..., 2], scene.heights, atol=1e-4)
         written["object"] = np.array("005_tomato_soup_can")
         np.savez(out, **written)
         demos = read_keypoints(

@@ -1,8 +1,7 @@
 """Demonstrations: the archive, DexYCB's layout, synthetic ones, and the commands."""
 
-import importlib.util
 from dataclasses import fields, replace
-from unittest import TestCase, skipUnless
+from unittest import TestCase
 from unittest.mock import patch
 
 import numpy as np
@@ -434,7 +433,6 @@ class Synthetic(InFolder):
                 self.assertEqual(getattr(a, array).tobytes(), getattr(b, array).tobytes())
         self.assertNotEqual(synthesize(["soup"], 1, seed=1).object_pos[0, 0], b.object_pos[0, 0])
 
-    @skipUnless(importlib.util.find_spec("manifold3d"), "manifold3d is not installed")
     def test_a_wall_of_ones_own_mesh_is_held_from_both_sides(self):
         trimesh.creation.annulus(0.0365, 0.04, 0.09, sections=16).export(self.folder / "tube.obj")
         demos = synthesize(None, per_object=1, seed=0, meshes=self.folder)

@@ -104,7 +104,6 @@ def recorded(name, object_name, steps):
     return recording
 
 
-@skipUnless(find_spec("mujoco"), "mujoco is not installed")
 class RuntimeTest(InFolder):
     def test_it_acts_as_the_evaluation_in_a_process_without_xreset(self):
         said = succeeds("export", "deploy", POLICY, "--out", f"{self.folder}/can")
@@ -449,7 +448,6 @@ class ToyTest(InFolder):
             self.assertLess(len(published), 120)
             assert_allclose(np.diff(published[-3:], axis=0), 0, atol=1e-3)
 
-    @skipUnless(find_spec("mujoco"), "mujoco is not installed")
     def test_an_evaluation_plays_the_graph_as_it_plays_the_network(self):
         trial = toy_grasp.trial(self.task)
         played = []

@@ -4,7 +4,6 @@ import io
 from contextlib import redirect_stdout
 from dataclasses import replace
 from functools import partial
-from unittest import SkipTest
 from unittest.mock import patch
 
 import numpy as np
@@ -26,12 +25,6 @@ from xreset.objects.catalogue import load_objects
 from xreset.policy.onnx_policy import OnnxPolicy, check_contract
 from xreset.policy.shipped import shipped
 from xreset.task.config import ObservationConfig, TaskConfig, evaluation_task
-
-try:
-    import xreset.backends.mujoco
-    import xreset.cameras.rays  # noqa: F401
-except (ImportError, XResetError) as error:
-    raise SkipTest(str(error)) from error
 
 TASK = TaskConfig(
     observation=ObservationConfig(

@@ -8,7 +8,7 @@ import sys
 import time
 from pathlib import Path
 from textwrap import dedent
-from unittest import SkipTest, TestCase, mock
+from unittest import TestCase, mock
 
 import torch
 from torch.testing import assert_close
@@ -18,11 +18,6 @@ from tests.toy_training import WithBank
 from xreset.learning.distributed import Processes
 from xreset.learning.recipes import starting_config
 from xreset.learning.run import checkpoints
-
-try:
-    import xreset.backends.mujoco  # noqa: F401
-except ImportError as error:
-    raise SkipTest(str(error)) from error
 
 ROOT = Path(__file__).resolve().parents[1]
 SMALL = (

@@ -3,7 +3,7 @@
 from dataclasses import replace
 from itertools import pairwise, product
 from types import SimpleNamespace
-from unittest import SkipTest, TestCase
+from unittest import TestCase
 from unittest.mock import patch
 
 import numpy as np
@@ -20,6 +20,7 @@ from tests.data import InFolder
 from tests.toy_bank import SOUP, SPAM, toy_bank, toy_retargeted
 from tests.toy_robot import toy_robot
 from xreset import make_bank
+from xreset.backends.mujoco import MujocoBackend
 from xreset.env.manipulation import ManipulationEnv, make_env, make_scene
 from xreset.errors import CapabilityError, XResetError
 from xreset.eval.baselines import KinematicRetargeting, ZeroPolicy
@@ -46,11 +47,6 @@ from xreset.task.config import (
 from xreset.task.observations import layout
 from xreset.task.tracker import Tracker
 from xreset.task.worlds import Worlds
-
-try:
-    from xreset.backends.mujoco import MujocoBackend
-except ImportError as error:
-    raise SkipTest(str(error)) from error
 
 N = 3
 TASK = TaskConfig(

@@ -16,6 +16,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from pandas.testing import assert_frame_equal
 from scipy.spatial.transform import Rotation
 from torch import tensor
+from torch.testing import assert_close
 
 from tests import toy_grasp
 from tests.data import InFolder
@@ -248,7 +249,7 @@ class MetricsTest(TestCase):
             "reorientation_progress", "task_progress", "turn",
         ):  # fmt: skip
             found = getattr(together, name)
-            torch.testing.assert_close(found, torch.cat([getattr(m, name) for m in alone]))
+            assert_close(found, torch.cat([getattr(m, name) for m in alone]))
 
     def test_a_world_that_is_not_finite_is_counted_and_no_longer_looked_at(self):
         nan = torch.full((3,), math.nan)

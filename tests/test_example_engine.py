@@ -13,6 +13,7 @@ from typing import Any, ClassVar
 from unittest.mock import patch
 
 import torch
+from torch.testing import assert_close
 
 from tests.data import InFolder
 from tests.engine_checks import with_drive
@@ -225,9 +226,7 @@ class DrakeTest(EngineTest, unittest.TestCase):
             backend.set_state(good)
             backend.step()
             self.assertFalse(backend.health().nonfinite[0])
-            torch.testing.assert_close(
-                backend.state().object_pos, good.object_pos, atol=1e-3, rtol=0
-            )
+            assert_close(backend.state().object_pos, good.object_pos, atol=1e-3, rtol=0)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """The numbered examples run as they are, in their order, and stay short; `import xreset` has the names that it promises."""
 
 import contextlib
-import importlib.util
+import importlib
 import inspect
 import io
 import os
@@ -10,7 +10,7 @@ import subprocess
 import sys
 from functools import partial
 from pathlib import Path
-from unittest import TestCase, mock, skipUnless
+from unittest import TestCase, mock
 
 import trimesh
 
@@ -31,15 +31,9 @@ def run(name, *arguments):
     return out.getvalue()
 
 
-def has(*packages):
-    return all(importlib.util.find_spec(package) for package in packages)
-
-
 class FaceTest(TestCase):
     def test_every_name_is_there_and_documented(self):
         for name in xreset.__all__:
-            if name == "VectorEnv" and not has("gymnasium"):
-                continue
             self.assertTrue(getattr(xreset, name).__doc__, name)
         with self.assertRaises(AttributeError):
             xreset.no_such_name  # noqa: B018
@@ -50,7 +44,7 @@ class FaceTest(TestCase):
         # of functions that are commands, too
         elsewhere |= {"Annotated", "Device", "Option", "Output", "Port", "Pose", "Png"}
         functions = 0
-        for name in set(xreset.__all__) - {"VectorEnv"}:  # which needs gymnasium
+        for name in xreset.__all__:
             value = getattr(xreset, name)
             if inspect.isfunction(value):
                 functions += 1
@@ -81,10 +75,6 @@ class ShelfTest(InFolder):
         lines = run("06_own_engine").splitlines()
         self.assertEqual([line.split()[0] for line in lines], ["passed", "passed", "failed"], lines)
 
-    @skipUnless(
-        has("coal", "sapien", "onnxruntime", "imageio_ffmpeg"),
-        "an engine or a codec is not installed",
-    )
     def test_a_shipped_policy_is_filmed_with_an_unseen_object(self):
         trimesh.creation.cylinder(radius=0.035, height=0.09).export(self.folder / "beaker.obj")
         film = partial(xreset.film, fps=2, size=(320, 240))
@@ -98,7 +88,6 @@ class ShelfTest(InFolder):
         self.assertTrue((self.folder / "my-robot" / "robot.png").is_file())
 
 
-@skipUnless(has("coal"), "coal is not installed")
 class FromABankTest(InOneFolder):
     """Examples that need the files of the first two."""
 
@@ -138,20 +127,17 @@ class FromABankTest(InOneFolder):
             run("04_own_reward", self.bank), r"upright pays 0\.[0-4]\d*[1-9]\d* per step"
         )
 
-    @skipUnless(has("rsl_rl", "onnx"), "rsl-rl-lib or onnx is not installed")
     def test_a_policy_is_trained(self):
         said = run("07_train", self.bank, self.folder / "run")
         self.assertIn("trained run for 2 iterations, on 005_tomato_soup_can", said)
         self.assertTrue((self.folder / "run" / "policy.onnx").is_file())
 
-    @skipUnless(has("onnxruntime", "matplotlib"), "onnxruntime or matplotlib is not installed")
     def test_a_policy_is_evaluated(self):
         self.assertRegex(
             run("08_evaluate_and_plot", self.folder, ("mujoco",)), r"task progress [1-9]\d*%"
         )
         self.assertTrue((self.folder / "progress.png").is_file())
 
-    @skipUnless(has("onnxruntime"), "onnxruntime is not installed")
     def test_a_policy_plays_where_nothing_can_train(self):
         hidden = "import sys; sys.modules.update(dict.fromkeys(('rsl_rl', 'warp', 'mujoco_warp', 'onnx', 'tensorboard')))"
         program = f"{hidden}; sys.path.insert(0, {str(EXAMPLES)!r}); __import__('09_play_a_policy').main(sys.argv[1])"
@@ -163,7 +149,6 @@ class FromABankTest(InOneFolder):
         distance = done.stdout.partition("the object ends ")[2].partition(" cm")[0]
         self.assertLess(float(distance), 5.0, done.stdout)
 
-    @skipUnless(has("onnxruntime"), "onnxruntime is not installed")
     def test_a_policy_says_where_it_cannot_play(self):
         bank = xreset.read_bank(self.bank)
         objects = [xreset.load_object(name) for name in bank.object_names]
@@ -184,6 +169,5 @@ class FromABankTest(InOneFolder):
             with self.assertRaisesRegex(xreset.XResetError, "World 1 does not exist"):
                 xreset.film("soup-can", env, "film.mp4", world=1)
 
-    @skipUnless(has("gymnasium"), "gymnasium is not installed")
     def test_other_learning_code_trains(self):
         self.assertRegex(run("10_gymnasium", self.bank), r"iteration 3: reward per step -?\d")

@@ -8,6 +8,7 @@ from pathlib import Path
 from unittest import skipUnless
 
 import numpy as np
+import pyarrow.parquet as parquet
 from numpy.testing import assert_allclose, assert_array_equal
 
 import xreset
@@ -19,10 +20,6 @@ from xreset.eval.export.recorded import read_recorded, write_arrays
 from xreset.eval.report.read import read_training, without_results
 from xreset.files.storage import file_hash
 from xreset.geometry.description import load_robot
-
-PARQUET = find_spec("pyarrow") is not None
-FILMS = PARQUET and find_spec("imageio_ffmpeg") is not None
-LEROBOT = find_spec("lerobot") is not None
 
 
 class Case(InFolder):
@@ -174,7 +171,6 @@ class Arrays(Case):
             xreset.export_episodes(str(self.folder), again, cameras=["front"])
 
 
-@skipUnless(PARQUET, "pyarrow is not installed")
 class LeRobot(Case):
     def films(self, **options):
         """The episodes of one engine, and a data set with small films of them."""
@@ -184,8 +180,6 @@ class LeRobot(Case):
         return recording, root
 
     def test_meta_agrees_with_the_data(self):
-        import pyarrow.parquet as parquet
-
         folder = self.evaluate()
         recording = read_recorded([folder])
         root = self.folder / "set"
@@ -242,7 +236,6 @@ class LeRobot(Case):
         self.assertRaisesRegex(XResetError, "no folder", write_lerobot, self.folder / "set", lost)
         self.assertEqual([p.name for p in self.folder.iterdir()], ["eval"])
 
-    @skipUnless(FILMS, "there is no encoder of films")
     def test_films_of_depth_cameras(self):
         _, root = self.films(cameras=("side",))
         films = sorted(path.parts[-3] for path in root.rglob("*.mp4"))
@@ -253,7 +246,7 @@ class LeRobot(Case):
         self.assertLess(stats["min"][0][0][0], 0.05)  # beyond the table
         self.assertGreater(stats["max"][0][0][0], 0.4)  # the table
 
-    @skipUnless(LEROBOT and FILMS, "the package lerobot is not installed")
+    @skipUnless(find_spec("lerobot"), "the package lerobot is not installed")
     def test_the_package_reads_it_back(self):
         from lerobot.datasets.lerobot_dataset import LeRobotDataset  # pyright: ignore[reportMissingImports]
 

@@ -2,12 +2,8 @@
 
 import re
 from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
-from unittest import SkipTest, TestCase
-
-if not find_spec("hypothesis"):
-    raise SkipTest("hypothesis is not installed (pip install 'xreset[dev]')")
+from unittest import TestCase
 
 import tyro
 from hypothesis import HealthCheck, given, settings

@@ -7,6 +7,7 @@ import torch
 import trimesh
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
+from torch.testing import assert_close
 
 from tests.toy_retarget import UPRIGHT, box_object, double
 from xreset import robots
@@ -219,4 +220,4 @@ class SelfCollisionTest(TestCase):
         moved = joints.clone()
         moved[:, column] += 1e-5
         change = (found(moved).value - here.value) / 1e-5
-        torch.testing.assert_close(change, here.slope[:, column], atol=2e-3, rtol=0.0)
+        assert_close(change, here.slope[:, column], atol=2e-3, rtol=0.0)

@@ -6,6 +6,7 @@ from unittest.mock import patch
 
 import numpy as np
 import trimesh
+from numpy.testing import assert_array_equal
 
 from tests.data import InOneFolder
 from tests.toy_bank import SOUP, SPAM, toy_bank, toy_retargeted
@@ -61,9 +62,7 @@ class InputsTest(InOneFolder):
         self.assertEqual((motion.robot_name, motion.hash), ("ur7e-sharpa", None))
         self.assertEqual(motion.bank.num_states, 0)
         for name in ("start_pos", "start_quat_wxyz", "goal_pos", "goal_quat_wxyz"):
-            np.testing.assert_array_equal(
-                getattr(motion.bank, name), getattr(demos.bank, name), name
-            )
+            assert_array_equal(getattr(motion.bank, name), getattr(demos.bank, name), name)
 
     def test_a_bank_names_its_robot(self):
         inputs = load_inputs(self.bank_file)
@@ -142,9 +141,7 @@ class InputsTest(InOneFolder):
         bank = starts_and_goals(
             toy_retargeted(self.robot, [SOUP], [0, 2]), self.robot, [replace(soup, friction=0.4)]
         )
-        np.testing.assert_array_equal(
-            (bank.object_mass, bank.object_friction), ([soup.mass], [0.4])
-        )
+        assert_array_equal((bank.object_mass, bank.object_friction), ([soup.mass], [0.4]))
         for changes, problem in (
             ({"friction": 0.4}, None),
             ({"friction": 0.43}, None),

@@ -9,6 +9,7 @@ import torch
 import trimesh
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
+from torch.testing import assert_close
 
 from tests.data import InFolder, InOneFolder
 from tests.toy_retarget import FLOAT, slope
@@ -23,8 +24,6 @@ from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.shapes import hull
 from xreset.geometry.urdf import RobotTree, load_urdf
 from xreset.geometry.urdf_writer import fixed, frame, pose, urdf_text, write_meshes
-
-assert_close = torch.testing.assert_close
 
 FIXED = (
     '<joint name="{name}" type="fixed"><parent link="base"/><child link="{child}"/><!----></joint>'

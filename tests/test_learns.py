@@ -3,11 +3,7 @@
 import unittest
 
 from tests.toy_learning import CONFIG, WORLDS, random_policy, scene, trained
-
-try:
-    from xreset.backends.mujoco import MujocoBackend
-except ImportError as error:
-    raise unittest.SkipTest(str(error)) from error
+from xreset.backends.mujoco import MujocoBackend
 
 MARGIN = 0.4
 """Share of steps with a grasp above a random policy's. Measured with five seeds: docs/faults.md, "Does training still learn?"."""

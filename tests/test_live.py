@@ -1,9 +1,8 @@
 """The loop around a driver: it observes what the environment observes, and every fault ends in a soft stop and a sentence."""
 
 from dataclasses import replace
-from importlib.util import find_spec
 from typing import ClassVar
-from unittest import TestCase, skipUnless
+from unittest import TestCase
 
 import numpy as np
 import torch
@@ -285,7 +284,6 @@ class FaultTest(TestCase):
         self.assertEqual((len(driver.sent), driver.stops), (150, 1))
 
 
-@skipUnless(find_spec("mujoco"), "mujoco is not installed")
 class EngineTest(TestCase):
     def test_the_graph_observes_what_the_environment_observes(self):
         for name in ("paper", "robust", "live", "published"):
@@ -326,7 +324,6 @@ class EngineTest(TestCase):
                 assert_allclose(target, env.joint_target, atol=1e-6)
 
 
-@skipUnless(find_spec("mujoco"), "mujoco is not installed")
 class SafetyTest(TestCase):
     """Limits of the loop stop a robot in an engine: a gripper that lifts a brick at 1.2 m/s."""
 

@@ -10,6 +10,7 @@ import numpy as np
 import trimesh
 import warp as wp
 from mujoco_warp._src import collision_convex
+from numpy.testing import assert_allclose
 
 from xreset.backends import mujoco_warp_depth, mujoco_warp_step
 from xreset.backends.conformance.scene import scene
@@ -72,7 +73,7 @@ class Depth(TestCase):
             data.qpos[:] = qpos[i]
             mujoco.mj_forward(model, data)
             expected = np.sort(data.contact.dist)
-            np.testing.assert_allclose(
+            assert_allclose(
                 np.sort(dist[world == i]), expected, atol=2e-6, err_msg=f"pose {qpos[i]}"
             )
             deepest = mujoco.mj_geomDistance(model, data, 0, 1, 1.0, None)

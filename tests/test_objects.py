@@ -1,18 +1,19 @@
 """Objects: stand-ins, sampling, rest, and the import of meshes."""
 
-import importlib.util
 import json
 import os
 import zipfile
 from dataclasses import replace
-from unittest import TestCase, skipUnless
+from unittest import TestCase
 from unittest.mock import Mock, patch
 
 import numpy as np
 import torch
 import trimesh
+from manifold3d import Manifold
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial import ConvexHull, cKDTree
+from torch.testing import assert_close
 
 from tests.command import refused, succeeds
 from tests.data import InFolder, data_dir
@@ -57,7 +58,6 @@ Z = np.array([0.0, 0.0, 1.0])
 BOX = trimesh.creation.box((0.1, 0.06, 0.04))
 CUBE = trimesh.creation.box((0.1, 0.1, 0.1))
 RING = trimesh.creation.annulus(0.036, 0.04, 0.02, sections=32)
-CUTS = skipUnless(importlib.util.find_spec("manifold3d"), "manifold3d is not installed")
 
 
 def _specks(edge):
@@ -246,7 +246,6 @@ class MeshImport(InFolder):
         assert_allclose(np.ptp(result.obj.vertices, axis=0), (0.1, 0.06, 0.04))
         self.assertEqual(self.load(BOX + near, facts="mass = 0.2").notes, ())
 
-    @CUTS
     def test_concave_mesh_is_cut_and_cached(self):
         first = self.load(RING).obj
         volume = sum(shape_mesh(piece).volume for piece in first.pieces)
@@ -296,7 +295,6 @@ class MeshImport(InFolder):
         ):
             self.load(RING)
 
-    @CUTS
     def test_open_meshes_are_closed_with_a_note(self):
         box = CUBE.subdivide().subdivide()
         result = self.load(trimesh.Trimesh(box.vertices, box.faces[:-1]), facts="mass = 1.0")
@@ -350,7 +348,6 @@ class MeshImport(InFolder):
         add_mesh(path, out, "brick", properties=Properties(mass=0.2))
         self.assertEqual(load_object("brick", out).mass, 0.2)
 
-    @CUTS
     def test_the_neck_of_a_bottle_stays_free(self):
         radius = np.array([0, 0.03, 0.03, 0.014, 0.014, 0.018, 0.018, 0])
         height = np.array([0, 0, 0.14, 0.16, 0.17, 0.171, 0.18, 0.18])
@@ -416,9 +413,7 @@ class MeshImport(InFolder):
 
     def test_own_friction_takes_the_place_of_the_middle(self):
         c = RandomizationConfig(friction=(0.5, 1.0))
-        torch.testing.assert_close(
-            own_friction([None, 0.95, 0.35], c), torch.tensor([[0.0], [0.1], [-0.2]])
-        )
+        assert_close(own_friction([None, 0.95, 0.35], c), torch.tensor([[0.0], [0.1], [-0.2]]))
 
     def test_bad_meshes(self):
         obj = CUBE.export(file_type="obj")
@@ -464,7 +459,6 @@ class MeshImport(InFolder):
         self.assertLess(distance_to_pieces(obj.vertices, obj.pieces).max(), 0.002)
 
 
-@CUTS
 class ThinWalls(InFolder):
     """Pieces keep to the surface."""
 
@@ -534,8 +528,6 @@ class ThinWalls(InFolder):
                 assert_allclose(pieces.com, np.array(shift) / 2, atol=1e-12)
 
     def test_slivers_whose_hull_is_flat_are_left_out(self):
-        from manifold3d import Manifold
-
         cube = Manifold.cube((0.1, 0.1, 0.1))
         sliver = Manifold.cube((0.138, 6e-9, 0.047))
         self.assertGreater(sliver.volume(), 3e-11)
@@ -581,7 +573,6 @@ class ThinWalls(InFolder):
             self.assertGreater(stopped.deviation, 0.002)
 
 
-@CUTS
 class RandomShapes(InFolder):
     def test_shapes_are_closed_graspable_and_reproducible(self):
         nine = make_shapes(f"{self.folder}/nine", 9, seed=3)

@@ -1,7 +1,5 @@
 """A live episode, without a browser: every way in which a user can interfere."""
 
-from importlib.util import find_spec
-from unittest import skipUnless
 from unittest.mock import patch
 
 import numpy as np
@@ -12,6 +10,7 @@ from tests.test_view import send_value
 from xreset.backends.mujoco import MujocoBackend
 from xreset.backends.single import SingleWorld, _BatchWorld
 from xreset.errors import XResetError
+from xreset.eval.play.page import Page
 from xreset.eval.play.record import write_film, write_trace
 from xreset.eval.play.session import AWAY, Session
 from xreset.eval.results import read_traces
@@ -171,10 +170,7 @@ class Played(InFolder):
         self.assertRaisesRegex(XResetError, "broke down. A new episode has begun", session.step)
         self.assertLess(self.steps(0.1).distance, 1.0)
 
-    @skipUnless(find_spec("viser"), "viser is not installed")
     def test_no_message_of_a_visitor_ends_the_page(self):
-        from xreset.eval.play.page import Page
-
         page = Page(self.session, port=8960)
         self.addCleanup(page.close)
         for control, value in (

@@ -3,21 +3,18 @@
 import io
 import unittest
 from contextlib import redirect_stdout
-from importlib.util import find_spec
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from tests.browser import Browser, find_chromium, wait_until
+from xreset.eval.play.page import Page
 from xreset.eval.play.session import Session
 
 
-@unittest.skipUnless(find_spec("viser"), "viser is not installed")
 class InTheBrowser(unittest.TestCase):
     @classmethod
     def setUpClass(cls):
-        from xreset.eval.play.page import Page
-
         cls.browser = Browser(find_chromium())
         cls.addClassCleanup(cls.browser.close)
         cls.session = Session("many-objects")

@@ -7,9 +7,8 @@ import shutil
 import tempfile
 from dataclasses import asdict
 from hashlib import sha256
-from importlib.util import find_spec
 from pathlib import Path
-from unittest import mock, skipUnless
+from unittest import mock
 
 import numpy as np
 import torch
@@ -231,7 +230,6 @@ class ShippedTest(WithPolicy):
         next(shipped.FOLDER.iterdir()).unlink()
         self.assertRaisesRegex(PolicyError, f"{expected}[.]", load_policy, "skiled")
 
-    @skipUnless(find_spec("mujoco"), "mujoco is not installed")
     def test_it_is_evaluated_traced_and_reported_by_name(self):
         write_demos("demos.npz", synthesize([SOUP], 1))
         succeeds("eval", "skilled", "--demos", "demos.npz", "--episodes", "1")

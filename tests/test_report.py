@@ -4,8 +4,7 @@ import re
 import subprocess
 from dataclasses import replace
 from html.parser import HTMLParser
-from importlib.util import find_spec
-from unittest import mock, skipUnless
+from unittest import mock
 
 import numpy as np
 import pandas as pd
@@ -365,7 +364,6 @@ class ClipTest(Reported):
     def test_a_film_of_all_objects_in_all_engines(self):
         self.assertEqual(self.film_height(None), 150)
 
-    @skipUnless(find_spec("warp"), "Warp draws what a policy sees")
     def test_a_film_shows_what_the_policy_sees(self):
         self.assertEqual(self.film_height(SEEING), 150 + 200)
 

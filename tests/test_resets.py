@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 from types import SimpleNamespace
-from unittest import SkipTest, TestCase, mock
+from unittest import TestCase, mock
 
 import numpy as np
 import torch
@@ -10,6 +10,7 @@ from numpy.testing import assert_allclose
 
 from tests.toy_bank import ONLY_FRAMES, SOUP, SPAM, in_this_process, toy_retargeted
 from xreset import FilterConfig, SqueezeConfig, robots
+from xreset.backends.mujoco import MujocoBackend
 from xreset.errors import DemoError
 from xreset.objects.catalogue import load_objects
 from xreset.objects.rest import rest_height
@@ -18,11 +19,6 @@ from xreset.resets.filter import REASONS
 from xreset.resets.probe import rejection
 from xreset.resets.verbs import make_bank
 from xreset.spec import TableSpec
-
-try:
-    from xreset.backends.mujoco import MujocoBackend
-except ImportError as error:
-    raise SkipTest(str(error)) from error
 
 UPRIGHT = np.array([1.0, 0, 0, 0])
 

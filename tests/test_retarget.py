@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from numpy.testing import assert_allclose, assert_array_equal
 from torch import tensor
+from torch.testing import assert_close
 
 from tests.command import refused, succeeds
 from tests.data import InOneFolder, data_dir
@@ -39,8 +40,6 @@ from xreset.retarget.pipeline import RetargetConfig
 from xreset.retarget.validity import REASONS, Measures, Thresholds, classify, too_deep
 from xreset.retarget.verbs import retarget_demos
 from xreset.spec import KEYPOINTS
-
-assert_close = torch.testing.assert_close
 
 
 class ChainTest(TestCase):

@@ -1,8 +1,7 @@
 """Faults between a policy and its robots, what they cost, and the verdict."""
 
 from dataclasses import replace
-from importlib.util import find_spec
-from unittest import TestCase, skipUnless
+from unittest import TestCase
 from unittest.mock import patch
 
 import numpy as np
@@ -28,7 +27,6 @@ from xreset.task.config import TaskConfig, evaluation_task
 STEPS = 30
 
 
-@skipUnless(find_spec("mujoco"), "mujoco is not installed")
 class FaultyDriverTest(TestCase):
     def setUp(self):
         self.trial = toy_grasp.trial(evaluation_task(TaskConfig()))
@@ -113,7 +111,6 @@ class FaultyDriverTest(TestCase):
             self.assertEqual(all(equal), same)
 
 
-@skipUnless(find_spec("mujoco"), "mujoco is not installed")
 class FrameTest(TestCase):
     def test_distances_do_not_depend_on_the_frame_of_the_object(self):
         task = evaluation_task(TaskConfig())
@@ -155,7 +152,6 @@ class VerdictTest(TestCase):
         self.assertEqual(verdict([swept([0.8] * 5, {("object-mass", 2.0): [0.8] * 5})]), ("", []))
 
 
-@skipUnless(find_spec("mujoco"), "mujoco is not installed")
 class CommandTest(InFolder):
     def test_a_verdict_from_the_command_line(self):
         demos = self.folder / "demos.npz"

@@ -1,29 +1,24 @@
 """The environment as Stable-Baselines3 knows it."""
 
-import unittest
 import warnings
 from dataclasses import replace
 
 import numpy as np
 import torch
+from numpy.testing import assert_allclose, assert_array_equal
+from stable_baselines3 import PPO
 
 from tests.command import succeeds
 from tests.data import InOneFolder
 from tests.test_env import TASK, BreakableBackend, N, WithEnv
 from tests.toy_bank import SOUP, toy_bank
 from xreset import load_object, load_robot, make_env
+from xreset.env.stable_baselines import StableBaselinesEnv
 from xreset.eval.results import read_evaluation
 from xreset.live.deploy import deployed_graph
 from xreset.live.engine import GraphPolicy
 from xreset.runtime import Controller
 from xreset.task.config import TerminationConfig, evaluation_task
-
-try:
-    from stable_baselines3 import PPO
-except ImportError as error:
-    raise unittest.SkipTest("stable-baselines3 is not installed") from error
-
-from xreset.env.stable_baselines import StableBaselinesEnv
 
 
 class StableBaselinesTest(WithEnv):
@@ -69,7 +64,7 @@ class StableBaselinesTest(WithEnv):
         self.assertEqual(env.log["health/nonfinite_total"], 1)
         for name, value in observations.items():
             self.assertTrue(np.isfinite(value).all(), name)
-            np.testing.assert_array_equal(infos[0]["terminal_observation"][name], before[name][0])
+            assert_array_equal(infos[0]["terminal_observation"][name], before[name][0])
         self.assertEqual(env.env.episode_length_buf.tolist(), [0] + [2] * (N - 1))
 
     def test_an_attribute_that_the_environment_lacks_is_refused(self):
@@ -134,7 +129,7 @@ class PlayedTest(InOneFolder):
             joints = world.backend.state().joint_pos
             expected = world.actions.targets(action, world.joint_target, joints)
             world.advance(graph.act(world.get_observations()))
-            np.testing.assert_allclose(world.joint_target, expected, atol=1e-5)
+            assert_allclose(world.joint_target, expected, atol=1e-5)
 
     def test_commands_play_it(self):
         file = self.folder / "mine.onnx"

@@ -6,9 +6,8 @@ import re
 import subprocess
 from contextlib import redirect_stdout
 from dataclasses import replace
-from importlib.util import find_spec
 from pathlib import Path
-from unittest import TestCase, skipUnless
+from unittest import TestCase
 from unittest.mock import Mock, patch
 
 import numpy as np
@@ -387,7 +386,6 @@ class TablesTest(Studied):
                 self.assertEqual("--episode-seconds" in command, seconds is not None)
 
 
-@skipUnless(find_spec("mujoco"), "MuJoCo is not installed")
 class WholeTest(InOneFolder):
     """The study of seconds, from the command line."""
 

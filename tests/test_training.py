@@ -14,12 +14,12 @@ import time
 from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
 from dataclasses import asdict, replace
 from pathlib import Path
-from unittest import SkipTest
 from unittest.mock import Mock, patch
 
 import numpy as np
 import onnx
 import torch
+from numpy.testing import assert_array_equal
 from onnx import numpy_helper
 from torch.testing import assert_close
 
@@ -55,11 +55,6 @@ from xreset.learning.run import (
 from xreset.learning.runner import TrainingRunner, _stop_on_interrupt
 from xreset.policy.onnx_policy import check_contract
 from xreset.task.config import RandomizationConfig, RewardConfig, TaskConfig
-
-try:
-    import xreset.backends.mujoco  # noqa: F401
-except ImportError as error:
-    raise SkipTest(str(error)) from error
 
 ONE = replace(CONFIG, iterations=1)
 
@@ -184,7 +179,7 @@ class TrainingTest(WithBank):
         self.assertEqual(
             (both.num_states, len(both.sequence_name), both.object_names), (6, 7, (SOUP, SPAM))
         )
-        np.testing.assert_array_equal(both.goal_pos[3:], goals.goal_pos)
+        assert_array_equal(both.goal_pos[3:], goals.goal_pos)
 
     def test_the_same_seed_gives_the_same_policy_and_resume_continues(self):
         one = newest(self.out)

@@ -2,8 +2,7 @@
 
 import json
 from dataclasses import replace
-from importlib.util import find_spec
-from unittest import TestCase, skipUnless
+from unittest import TestCase
 from unittest.mock import Mock, patch
 
 import numpy as np
@@ -42,7 +41,6 @@ OBJECTS = objects()[:2]
 BRICK, CAN = (spec.name for spec in OBJECTS)
 LIFT, SWING, TURN, JAW = map(ROBOT.joint_names.index, ("lift", "swing", "turn", "jaw_a_slide"))
 UPRIGHT = torch.tensor([1.0, 0, 0, 0])
-MUJOCO = skipUnless(find_spec("mujoco"), "MuJoCo is not installed")
 
 
 def joints(lift, swing=0.0, turn=0.0):
@@ -261,7 +259,6 @@ class TransferTest(TestCase):
             with self.subTest(name):
                 self.assertIs(add_transfers(base, data, ROBOT, OBJECTS, config), base)
 
-    @MUJOCO
     def test_a_grasp_that_does_not_hold_the_weight_is_left_out(self):
         """The grasp of frame 1 presses with a twentieth of the force of that of frame 2."""
         base = bank(self.data, (PRESSING, PRESSING / 20, PRESSING))
@@ -365,7 +362,6 @@ class BankTest(InFolder):
         self.assertIn("grasp of another demonstration", view.text(3))
 
 
-@MUJOCO
 class CommandTest(InFolder):
     def setUp(self):
         super().setUp()

@@ -11,6 +11,7 @@ from unittest.mock import patch
 
 import numpy as np
 import torch
+from numpy.testing import assert_allclose, assert_array_equal
 
 from ci import try_page
 from tests.browser import Browser, find_chromium, wait_until
@@ -90,7 +91,7 @@ class PhysicsTest(unittest.TestCase):
         compared = 0
         for name, found in zip(numbers, there, strict=True):
             if found is not None:  # this version of MuJoCo has it
-                np.testing.assert_array_equal(found, numbers[name].ravel(), err_msg=name)
+                assert_array_equal(found, numbers[name].ravel(), err_msg=name)
                 compared += numbers[name].size > 0
         self.assertGreater(compared, 100)
 
@@ -121,7 +122,7 @@ class PolicyTest(unittest.TestCase):
                 goalQuat=session.goal_quat.tolist(),
             )
             moment = session.step()
-            np.testing.assert_allclose(target, moment.joint_target, rtol=0, atol=1e-5)
+            assert_allclose(target, moment.joint_target, rtol=0, atol=1e-5)
 
 
 class Files(http.server.SimpleHTTPRequestHandler):
@@ -225,7 +226,7 @@ class PageTest(unittest.TestCase):
         self.browser.drag(goal, goal + np.array((40, 0)), steps=2)
         moved = np.array(self.browser.evaluate(place))
         self.assertGreater(np.linalg.norm(moved[:3] - start[:3]), 0.02)
-        np.testing.assert_allclose(moved[3:], start[3:], atol=1e-6)
+        assert_allclose(moved[3:], start[3:], atol=1e-6)
         x, y = self.browser.evaluate("xreset.view.onPage(xreset.view.goal.position)")
         for distance in range(8, 80, 2):
             self.browser.send(

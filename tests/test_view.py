@@ -9,14 +9,17 @@ import urllib.request
 from contextlib import redirect_stdout
 from dataclasses import replace
 from http.client import HTTPConnection
-from importlib.util import find_spec
-from unittest import mock, skipUnless
+from unittest import mock
 from xml.etree import ElementTree
 
 import msgspec
 import numpy as np
 import torch
+import viser
 from numpy.testing import assert_allclose, assert_array_equal
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
+from websockets.typing import Subprotocol
 
 from tests import toy_bank
 from tests.browser import wait_until
@@ -31,7 +34,9 @@ from xreset.pictures.meshes import rgb, tint
 from xreset.pictures.render import write_png
 from xreset.pictures.view.colors import reason_color
 from xreset.pictures.view.load import load_view
+from xreset.pictures.view.page import Page
 from xreset.pictures.view.picture import Drawer
+from xreset.pictures.view.server import WebPage, _own_page_only, is_own_page
 
 FRAMES = 4
 TOTAL = 2 * FRAMES
@@ -88,10 +93,6 @@ def toy_retargeted(robot):
 
 def send_value(page, control, value):
     """Give a control of a page a value, as a visitor with a program of his own can."""
-    import viser
-    from websockets.sync.client import connect
-    from websockets.typing import Subprotocol
-
     protocol = Subprotocol(f"viser-v{viser.__version__}")
     message = {"type": "GuiUpdateMessage", "uuid": control._impl.uuid}
     message |= {"updates": {"value": value}}
@@ -234,10 +235,9 @@ class Pictures(WithFiles):
             expected, Drawer(load_view(self.retargeted), size=(960, 720), smooth=True).draw(5)
         )
         self.assertEqual(out.read_bytes(), expected.read_bytes())
-        if find_spec("imageio_ffmpeg"):
-            film = self.folder / "view.mp4"
-            self.assertIn("2 frames", succeeds("view", self.bank, "--mp4", film, "--sequence", 0))
-            self.assertEqual(film.read_bytes()[4:8], b"ftyp")
+        film = self.folder / "view.mp4"
+        self.assertIn("2 frames", succeeds("view", self.bank, "--mp4", film, "--sequence", 0))
+        self.assertEqual(film.read_bytes()[4:8], b"ftyp")
         self.assertIn(
             "Frame 4 does not exist", refused("view", self.retargeted, "--png", out, "--frame", 4)
         )
@@ -247,11 +247,8 @@ class Pictures(WithFiles):
             self.assertIn("pip install 'xreset[viewer]'", refused("view", self.bank))
 
 
-@skipUnless(find_spec("viser"), "viser is not installed")
 class Served(WithFiles):
     def page(self, path, **options):
-        from xreset.pictures.view.page import Page
-
         with redirect_stdout(io.StringIO()):
             page = Page(load_view(path), port=8930, **options)
         self.addCleanup(page.close)
@@ -366,13 +363,10 @@ class Served(WithFiles):
         self.assertNotIn("Traceback", rest)
 
 
-@skipUnless(find_spec("viser"), "viser is not installed")
 class OwnPageOnly(WithFiles):
     """A socket from another site, or a name that is made to point here, gets nothing."""
 
     def test_headers(self):
-        from xreset.pictures.view.server import is_own_page
-
         for host, origin, served, expected in (
             ("localhost:8080", None, "127.0.0.1", True),
             ("127.0.0.1:8080", "http://127.0.0.1:8080", "127.0.0.1", True),
@@ -392,12 +386,6 @@ class OwnPageOnly(WithFiles):
                 self.assertEqual(is_own_page(host, origin, served), expected)
 
     def test_the_server(self):
-        import viser
-        from websockets.exceptions import InvalidStatus
-        from websockets.sync.client import connect
-
-        from xreset.pictures.view.server import _own_page_only
-
         with _own_page_only("127.0.0.1") as guarded:
             server = viser.ViserServer(host="127.0.0.1", port=8990, verbose=False)
         self.addCleanup(server.stop)
@@ -417,8 +405,6 @@ class OwnPageOnly(WithFiles):
             pass
 
     def test_a_port_that_no_machine_has(self):
-        from xreset.pictures.view.server import WebPage
-
         with (
             mock.patch("viser.ViserServer") as server,
             self.assertRaisesRegex(
@@ -429,8 +415,6 @@ class OwnPageOnly(WithFiles):
         server.assert_not_called()
 
     def test_a_server_that_cannot_be_restricted_is_stopped(self):
-        from xreset.pictures.view.page import Page
-
         with (
             mock.patch(
                 "viser.ViserServer"

@@ -1,22 +1,21 @@
 """xreset view in a real, headless browser: what the user moves there is what the server shows."""
 
 import io
-import unittest
 from contextlib import redirect_stdout
 from dataclasses import replace
-from importlib.util import find_spec
 
 import numpy as np
+from numpy.testing import assert_allclose
 
 from tests.browser import INPUT, Browser, find_chromium, wait_until
 from tests.test_view import WithFiles, toy_demos
 from xreset import write_demos
 from xreset.pictures.view.load import load_view
+from xreset.pictures.view.page import Page
 
 SLIDER = INPUT + ".querySelector('[role=slider]')"
 
 
-@unittest.skipUnless(find_spec("viser"), "viser is not installed")
 class InTheBrowser(WithFiles):
     @classmethod
     def setUpClass(cls):
@@ -26,8 +25,6 @@ class InTheBrowser(WithFiles):
 
     def open(self, path, **options):
         """A page that the browser shows."""
-        from xreset.pictures.view.page import Page
-
         with redirect_stdout(io.StringIO()):
             page = Page(load_view(path, **options), port=8940)
         self.addCleanup(page.close)
@@ -79,7 +76,7 @@ class InTheBrowser(WithFiles):
         self.assertEqual(page.row, 0)
         self.assertIn("Green: the object at its goal.", self.browser.text())
         can = page._scene._objects[0]
-        np.testing.assert_allclose(can.position, page.view.object_pos[0])
+        assert_allclose(can.position, page.view.object_pos[0])
         self.browser.evaluate(f"{SLIDER.format(label='frame')}.focus()")
         self.browser.key("ArrowRight")
         self.until(

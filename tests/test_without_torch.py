@@ -2,8 +2,6 @@
 
 import subprocess
 import sys
-from importlib.util import find_spec
-from unittest import skipUnless
 
 from tests.data import InFolder
 from tests.toy_results import toy_result
@@ -48,7 +46,6 @@ write_film("play.mp4", session, seconds=0.1)
 """
 
 
-@skipUnless(find_spec("onnxruntime") and find_spec("mujoco"), "needs onnxruntime and mujoco")
 class WithoutTorchTest(InFolder):
     def run_blocked(self, code):
         """Run code in a process that finds no torch; returns what it prints."""
@@ -67,7 +64,6 @@ class WithoutTorchTest(InFolder):
         self.assertLess(distance, 0.03)
         self.assertTrue((self.folder / "play.mp4").stat().st_size)
 
-    @skipUnless(find_spec("onnx"), "onnx is not installed")
     def test_policies_that_ship_are_exported(self):
         names = shipped_graphs()
         export = "export deploy {0} --out on_robot/{0} --object soup".format

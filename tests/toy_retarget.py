@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import torch
+from torch.testing import assert_close
 
 from xreset.geometry.rotations import matrix_to_quat, quat_from_axis_angle, quat_multiply
 from xreset.geometry.shapes import box, surface_of
@@ -93,4 +94,4 @@ def check_gradient(model, targets, config, state, frames):
     for frame in frames:
         for k in range(gradient.shape[-1]):
             half = slope(cost, torch.zeros_like(gradient), (slice(None), frame, k)) / 2
-            torch.testing.assert_close(gradient[:, frame, k], half, rtol=2e-3, atol=atol)
+            assert_close(gradient[:, frame, k], half, rtol=2e-3, atol=atol)

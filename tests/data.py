@@ -2,6 +2,7 @@
 
 import os
 import tempfile
+from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 from unittest import SkipTest, TestCase, skipUnless
@@ -11,6 +12,13 @@ DEFAULT = Path(__file__).resolve().parents[2] / "shared" / "data"
 PYBULLET = skipUnless(
     find_spec("pybullet"), "PyBullet is not installed: it has wheels for Python 3.11 only"
 )
+
+
+@contextmanager
+def refuses(test, words, error, case=None):
+    """One case of a test: the block must raise the error, in whose message ``words`` is found. A failure names the case."""
+    with test.subTest(words if case is None else case), test.assertRaisesRegex(error, words):
+        yield
 
 
 def data_dir():

@@ -13,7 +13,7 @@ from torch import tensor
 from torch.testing import assert_close
 
 from tests.command import succeeds, xreset
-from tests.data import InFolder
+from tests.data import InFolder, refuses
 from tests.toy_retarget import FLOAT, arm_targets, double
 from xreset import robots, synthesize, write_demos
 from xreset.errors import RobotError
@@ -138,7 +138,7 @@ class PlaceTest(InFolder):
             ({"x": (1.0, 0.0)}, "x is .*two finite numbers, the lower one first"),
             ({"tilt": (0.0, np.nan)}, "tilt is"),
         ):
-            with self.subTest(words), self.assertRaisesRegex(ValueError, words):
+            with refuses(self, words, ValueError):
                 PlaceConfig(**changes)
 
     def test_parameters_of_a_placement_come_back(self):

@@ -1,7 +1,6 @@
 """Depth cameras: what the rays hit, errors of the images, the same picture in every engine, timing, and refusals."""
 
 from dataclasses import replace
-from functools import partial
 from unittest import TestCase, mock
 
 import numpy as np
@@ -11,7 +10,8 @@ from numpy.testing import assert_array_equal
 from torch import tensor
 from torch.testing import assert_close
 
-from tests.toy_bank import SOUP, toy_bank
+from tests.data import refuses
+from tests.toy_bank import SOUP, in_this_process, toy_bank
 from tests.toy_robot import toy_robot
 from xreset.cameras.config import CameraConfig, DepthNoise, VisionConfig
 from xreset.cameras.rays import RayCaster
@@ -20,7 +20,6 @@ from xreset.env.manipulation import make_env, make_scene
 from xreset.errors import RobotError, XResetError
 from xreset.objects.catalogue import load_objects
 from xreset.physics import State
-from xreset.physics.plugins import make_backend
 from xreset.task.config import ObservationConfig, RandomizationConfig, TaskConfig, evaluation_task
 
 IDEAL = DepthNoise(spread=0.0, step=0.0, holes=0.0, edges=0.0)
@@ -159,7 +158,7 @@ class TestCameras(TestCase):
             (inside, XResetError, "inside the robot's link 'palm'"),
             (below, XResetError, "inside the table"),
         ):
-            with self.subTest(words), self.assertRaisesRegex(error, words):
+            with refuses(self, words, error):
                 self.cameras(replace(VISION, cameras=(camera,)))
         with (
             mock.patch("xreset.cameras.rays.wp.launch", side_effect=RuntimeError("no driver")),
@@ -176,7 +175,7 @@ class TestCameras(TestCase):
             ("pos is .*, expected three finite numbers", {"pos": (0.5, 0.2)}),
             ("pos is .*, expected three finite numbers", {"pos": (0.5, 0.2, float("nan"))}),
         ):
-            with self.subTest(changes), self.assertRaisesRegex(ValueError, words):
+            with refuses(self, words, ValueError, changes):
                 replace(ABOVE, **changes)
         few = VisionConfig(cameras=(ABOVE,), width=8, height=8, view="points", points=64)
         self.assertEqual(self.look(self.cameras(few)).shape, (2, 1, 64, 4))
@@ -193,7 +192,7 @@ class TestVisionInTheEnvironment(TestCase):
 
     def make(self, vision, **changes):
         task = replace(evaluation_task(TASK), vision=vision, **changes)
-        with mock.patch("xreset.env.manipulation.make_backend", partial(make_backend, workers=0)):
+        with in_this_process():
             return self.enterContext(
                 make_env(self.robot, self.objects, self.bank, task, num_envs=2)
             )

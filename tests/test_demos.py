@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose, assert_array_equal, assert_array_less
 from scipy.spatial.transform import Rotation
 
 from tests.command import refused, succeeds
-from tests.data import InFolder, data_dir
+from tests.data import InFolder, data_dir, refuses
 from xreset import synthesize
 from xreset.demos import hand
 from xreset.demos.archive import (
@@ -124,7 +124,7 @@ class Archive(InFolder):
             (replace(self.demos, fps=0.0), "fps"),
             (replace(self.demos, subjects=np.array(["a"])), "belong together"),
         ):
-            with self.subTest(message), self.assertRaisesRegex(DemoError, message):
+            with refuses(self, message, DemoError):
                 write_demos(f"{self.folder}/bad.npz", demos)
             self.assertEqual(list(self.folder.iterdir()), [])
         path = self.folder / "a.npz"
@@ -323,7 +323,7 @@ class DexYCB(InFolder):
         assert_same_motion(read, self.demos)
 
     def refused(self, message, root=None):
-        with self.subTest(message), self.assertRaisesRegex(DemoError, message):
+        with refuses(self, message, DemoError):
             read_dexycb(root or self.folder)
 
     def test_reads_back_the_table_frame(self):

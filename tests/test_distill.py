@@ -3,15 +3,16 @@
 import io
 from contextlib import redirect_stdout
 from dataclasses import replace
-from functools import partial
 from unittest.mock import patch
 
 import numpy as np
 import pandas as pd
 import torch
 
+from tests.data import refuses
+from tests.toy_bank import in_this_process
 from tests.toy_training import CONFIG, OPTIONS, WithBank, quickly
-from xreset import make_backend, make_env, resume, train
+from xreset import make_env, resume, train
 from xreset.cameras.config import FRONT, STUDENT_VISION, WRIST, VisionConfig
 from xreset.errors import PolicyError, XResetError
 from xreset.eval.report.fairness import missed_by_student
@@ -41,9 +42,7 @@ class DistillTest(WithBank):
     @classmethod
     def setUpClass(cls):
         super().setUpClass()
-        cls.enterClassContext(
-            patch("xreset.env.manipulation.make_backend", partial(make_backend, workers=0))
-        )
+        cls.enterClassContext(in_this_process())
         cls.teacher = cls.folder / "teacher"
         config = TrainConfig(
             task=TASK, model=SMALL, ppo=PpoConfig(horizon=8, mini_epochs=1), iterations=1
@@ -149,7 +148,7 @@ class DistillTest(WithBank):
                 {"teacher": self.run_folder, "config": student_config(TASK, IMAGES)},
             ),
         ):
-            with self.subTest(words), quickly(), self.assertRaisesRegex(error, words):
+            with quickly(), refuses(self, words, error):
                 train(**(two | options))
             self.assertFalse((self.folder / "refused").exists(), words)
         small = replace(STUDENT_VISION, width=8, height=8)

@@ -5,7 +5,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from tests.data import InFolder
+from tests.data import InFolder, refuses
 from xreset.backends.conformance import SCHEMA
 from xreset.errors import FileFormatError, XResetError
 from xreset.eval.engines.page import page, read
@@ -92,6 +92,6 @@ class PageTest(InFolder):
             ({"schema": "xreset-eval/1"}, "xreset-eval/1.*expected '" + SCHEMA),
             ({"schema": SCHEMA, "runs": [{}]}, "not a complete " + SCHEMA),
         ):
-            with self.subTest(message), self.assertRaisesRegex(FileFormatError, message):
+            with refuses(self, message, FileFormatError):
                 self.page_of(data)
         self.assertRaisesRegex(XResetError, "nothing to make a page of", self.page_of)

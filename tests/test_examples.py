@@ -15,7 +15,7 @@ from unittest import TestCase, mock
 import trimesh
 
 import xreset
-from tests.data import InFolder, InOneFolder
+from tests.data import InFolder, InOneFolder, refuses
 from tests.toy_bank import ONLY_FRAMES
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
@@ -164,7 +164,7 @@ class FromABankTest(InOneFolder):
                     "^path is film.gif, expected a name that ends in .mp4",
                 ),
             ):
-                with self.subTest(message), self.assertRaisesRegex(xreset.XResetError, message):
+                with refuses(self, message, xreset.XResetError):
                     xreset.film(*arguments)
             with self.assertRaisesRegex(xreset.XResetError, "World 1 does not exist"):
                 xreset.film("soup-can", env, "film.mp4", world=1)

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 
 from tests.command import succeeds
-from tests.data import InFolder, InOneFolder
+from tests.data import InFolder, InOneFolder, refuses
 from tests.toy_bank import SOUP, in_this_process
 from tests.toy_goals import toy_goals
 from xreset import GoalConfig, load_object, load_policy, load_robot
@@ -87,21 +87,10 @@ class MadeTest(InOneFolder):
             (GoalError, "Unknown family 'turn'. Choose from: lift, ", {"families": "turn"}),
         ):
             with (
-                self.subTest(message),
                 mock.patch("xreset.resets.goals._DRAWS", 2),
-                self.assertRaisesRegex(error, message),
+                refuses(self, message, error),
             ):
                 make_goals(["banana"], robot=self.robot, **options)
-
-    def test_a_goal_of_ones_own(self):
-        pose = (0.6, 0.25, 0.3, 1, 0, 0, 0)
-        goals = make_goals(["banana"], robot=self.robot, poses=[pose])
-        self.assertEqual(
-            (goals.family.tolist(), goals.sequence_name.tolist()), (["own"], [f"{BANANA}/own_000"])
-        )
-        assert_allclose(
-            np.concatenate((goals.goal_pos[0], goals.goal_quat_wxyz[0])), pose, atol=1e-6
-        )
 
     def test_the_command_draws_what_its_options_say(self):
         pose = (0.6, 0.25, 0.3, 1, 0, 0, 0)
@@ -114,6 +103,8 @@ class MadeTest(InOneFolder):
             ["banana"], robot=self.robot, families=["yaw"], poses=[pose], config=config
         )
         assert_allclose(read_goals(file).goal_pos, expected.goal_pos)
+        own = np.concatenate((expected.goal_pos[2], expected.goal_quat_wxyz[2]))
+        assert_allclose(own, pose, atol=1e-6)
 
 
 class UsedTest(InFolder):
@@ -167,5 +158,5 @@ class UsedTest(InFolder):
                 {"object_sources": ("abc", "stand-in")},
             ),
         ):
-            with self.subTest(message), self.assertRaisesRegex(error, message):
+            with refuses(self, message, error):
                 load_inputs(toy_goals(self.robot, **changes))

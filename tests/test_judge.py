@@ -3,7 +3,6 @@
 import io
 from contextlib import redirect_stdout
 from dataclasses import replace
-from unittest import mock
 
 import numpy as np
 import torch
@@ -11,7 +10,7 @@ from PIL import Image
 
 from tests import toy_grasp
 from tests.data import InFolder
-from tests.toy_grasp import OPEN, brick, brick_pose, robot
+from tests.toy_grasp import OPEN, brick, robot
 from xreset import SqueezeConfig, load_robot, write_bank
 from xreset.cli import main
 from xreset.errors import DemoError, RobotError
@@ -22,15 +21,9 @@ from xreset.robot_tools.verbs import judge
 
 def bank():
     """Six states with the brick between the jaws, 5 cm above where the demonstrations start; half are before contact."""
-    pos, quat = brick_pose()
-    base = toy_grasp.bank()
-    return replace(
-        base,
-        joint_pos=np.tile(robot().home, (6, 1)).astype(np.float32),
-        object_pos=np.tile(pos, (6, 1)).astype(np.float32),
-        object_quat_wxyz=np.tile(quat, (6, 1)).astype(np.float32),
-        start_pos=base.start_pos - np.array([0, 0, 0.05], dtype=np.float32),
-    )
+    found = toy_grasp.grasps()
+    found.start_pos[:, 2] -= 0.05
+    return found
 
 
 class Judge(InFolder):
@@ -78,10 +71,7 @@ class Judge(InFolder):
             judge(bank(), robot(), ())
 
     def test_a_weak_grip_drops_in_the_command(self):
-        self.enterContext(mock.patch("xreset.resets.inputs.load_robot", return_value=robot()))
-        self.enterContext(mock.patch("xreset.resets.inputs.load_objects", return_value=(brick(),)))
-        source = mock.patch("xreset.resets.inputs.object_source", return_value=brick().source)
-        self.enterContext(source)
+        self.enterContext(toy_grasp.found())
         write_bank(f"{self.folder}/bank.npz", bank())
         words = (
             f"--robot gripper --engine mujoco --squeeze.force 0.2 --picture {self.folder}/judge.png"

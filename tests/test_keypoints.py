@@ -12,17 +12,14 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
 from tests.command import succeeds, xreset
-from tests.data import InFolder, data_dir
+from tests.data import InFolder, data_dir, refuses
 from tests.test_demos import angles, assert_same_motion
+from tests.wrong_recordings import CAMERA
 from xreset import read_demos, synthesize
 from xreset.demos.keypoints import ORDERS, Convention, read_keypoints
 from xreset.errors import DemoError, FileFormatError
 from xreset.geometry.shapes import turn_of
 
-CAMERA = np.eye(4)
-CAMERA[:3, :3] = Rotation.from_euler("xyz", [2.2, 0.1, 3.0]).as_matrix()
-CAMERA[:3, 3] = (0.4, 1.3, 0.9)
-"""Pose of a camera that looks down at the table."""
 PLAIN = Convention(order="mediapipe", units="m", frame="table", fps=10.0)
 
 
@@ -215,7 +212,7 @@ class Synthetic(InFolder):
             ("column side changes", first.replace(",right,", ",left,", 1)),
         ):
             path.write_text(text)
-            with self.subTest(words), self.assertRaisesRegex(DemoError, words):
+            with refuses(self, words, DemoError):
                 read_keypoints(path, PLAIN)
 
     def test_comments_capitals_and_a_side_with_one(self):

@@ -4,7 +4,7 @@ from unittest import mock
 
 import torch
 
-from tests.data import InFolder
+from tests.data import InFolder, refuses
 from xreset.errors import FileFormatError, XResetError
 from xreset.files.storage import write_json
 from xreset.learning.clock import Lift, read_lift, write_lift
@@ -59,12 +59,11 @@ class LiftTest(InFolder):
             ("share is 1e.308, expected a", {"passed": [passing]}),
         ):
             write_json(self.folder / "lift.json", {"schema": "xreset-lift/1"} | changes)
-            with self.subTest(words), self.assertRaisesRegex(FileFormatError, words):
+            with refuses(self, words, FileFormatError):
                 read_lift(self.folder)
             write_json(self.folder / "run.json", {"lift": changes})
             with (
-                self.subTest(words),
-                self.assertRaisesRegex(FileFormatError, f"run.json: .*{words}"),
+                refuses(self, f"run.json: .*{words}", FileFormatError, words),
             ):
                 read_lift(self.folder)
             (self.folder / "run.json").unlink()

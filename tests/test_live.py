@@ -167,23 +167,16 @@ class FaultTest(TestCase):
             return target + 0.01
 
         controller.act = act
-        driver = Scripted()
-        with self.assertLogs("xreset"):
-            outcome = Runner(controller, driver, Limits(workspace=((-1, 0, 0), (0.4, 1, 1)))).run(
-                30
-            )
-        self.assertEqual(
-            outcome.reason, "Link palm is at (0.50, 0.50, 0.50), outside the workspace."
-        )
-        driver = Scripted()
-        controller.target *= 0
-        with self.assertLogs("xreset"):
-            outcome = Runner(controller, driver, Limits(workspace=((-1, 0, 0), (0.6, 1, 1)))).run(
-                30
-            )
-        self.assertEqual(
-            outcome.reason, "Link tip is at (0.61, 0.50, 0.50), outside the workspace."
-        )
+        for limit, words in (
+            (0.4, "palm is at (0.50, 0.50, 0.50)"),
+            (0.6, "tip is at (0.61, 0.50"),
+        ):
+            driver = Scripted()
+            controller.target *= 0
+            limits = Limits(workspace=((-1, 0, 0), (limit, 1, 1)))
+            with self.assertLogs("xreset"):
+                outcome = Runner(controller, driver, limits).run(30)
+            self.assertIn(words, outcome.reason)
         self.assertLess(driver.sent[-1][0], 0.7)
 
     def test_resting_targets_are_sent_as_long_as_the_robot_holds(self):
@@ -328,7 +321,7 @@ class SafetyTest(TestCase):
     """Limits of the loop stop a robot in an engine: a gripper that lifts a brick at 1.2 m/s."""
 
     def lift(self, limits, fault=lambda time, reading: reading):
-        """Return the outcome, and lift, its velocity, the palm's and the brick's height at the end of every step [steps, 4]."""
+        """Return the outcome, and lift, its velocity and the brick's height at the end of every step [steps, 3]."""
         played = toy_grasp.trial(evaluation_task(TaskConfig()))
         rows = []
         with played.worlds(engine("mujoco", workers=0), torch.zeros(1, dtype=torch.long)) as env:
@@ -337,8 +330,7 @@ class SafetyTest(TestCase):
 
             def look():
                 state = backend.state()
-                palm = backend.links().pos[0, 0, 2]
-                row = (state.joint_pos[0, 0], state.joint_vel[0, 0], palm, state.object_pos[0, 2])
+                row = (state.joint_pos[0, 0], state.joint_vel[0, 0], state.object_pos[0, 2])
                 rows.append([float(value) for value in row])  # the engine writes into its tensors
 
             driver = EngineDriver(env, look)
@@ -355,22 +347,6 @@ class SafetyTest(TestCase):
         self.assertLess(abs(rows[-1, 1]), 0.01)
         self.assertLess(rows[-1, 0], 0.25)
 
-    def test_targets_are_slowed_to_their_limit(self):
-        outcome, rows = self.lift(Limits(target_speed=0.05))
-        self.assertIsNone(outcome.reason)
-        self.assertLess(rows[30:, 1].max(), 0.15)
-        self.assertGreater(rows[60, 0], 0.05)
-
-    def test_a_link_that_leaves_the_workspace_stops_the_robot(self):
-        _, free = self.lift(Limits(target_speed=0.1))
-        top = float(free[0, 2]) + 0.05
-        limits = Limits(target_speed=0.1, hold=0.5, workspace=((-9, -9, -9), (9, 9, top)))
-        with self.assertLogs("xreset"):
-            outcome, rows = self.lift(limits)
-        self.assertRegex(outcome.reason or "", "Link palm is at .*, outside the workspace")
-        self.assertGreater(free[:, 2].max(), top + 0.1)
-        self.assertLess(rows[:, 2].max(), top + 0.04)
-
     def test_a_stopped_robot_holds_position_and_grip(self):
         with self.assertLogs("xreset"):
             limits = Limits(target_speed=0.1, pose_age=0.2, hold=2.0)
@@ -378,17 +354,17 @@ class SafetyTest(TestCase):
         self.assertIn("pose of the object is", outcome.reason or "")
         held = rows[-90:]
         assert_allclose(held[:, 0], held[0, 0], atol=1e-3)
-        assert_allclose(held[:, 3], held[0, 3], atol=2e-3)
-        self.assertGreater(held[0, 3], rows[0, 3] + 0.05)
+        assert_allclose(held[:, 2], held[0, 2], atol=2e-3)
+        self.assertGreater(held[0, 2], rows[0, 2] + 0.05)
 
 
 class Lifting:
     """In place of a controller: the gripper closes, and lifts as fast as it is allowed to."""
 
-    outputs = ("target", "links")
+    links = None
+    outputs = ("target",)
 
     def __init__(self, env):
-        self.env = env
         robot = env.backend.scene.robot
         self.contract = deploy_contract(robot, env.task)
         self.dt = env.task.control_dt
@@ -399,7 +375,6 @@ class Lifting:
         self.step_size = joint_values(self.contract, "step", 0.0)
 
     def step(self, reading):
-        self.links = self.env.backend.links().pos.numpy()
         target = self.target.copy()
         target[0, -1] = toy_grasp.CLOSED
         target[0, 0] += 0.02

@@ -5,7 +5,7 @@ from unittest.mock import patch
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 
-from tests.data import InFolder
+from tests.data import InFolder, refuses
 from tests.test_view import send_value
 from xreset.backends.mujoco import MujocoBackend
 from xreset.backends.single import SingleWorld, _BatchWorld
@@ -155,7 +155,7 @@ class Played(InFolder):
             (session.choose_object, "nosuch", "Unknown object 'nosuch'"),
             (session.choose_policy, "nosuch", "Unknown policy 'nosuch'"),
         ):
-            with self.subTest(words), self.assertRaisesRegex(XResetError, words):
+            with refuses(self, words, XResetError):
                 choose(name)
         for name, value in session.world.state.items():
             assert_array_equal(value, before[name])

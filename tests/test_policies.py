@@ -1,7 +1,6 @@
 """Policies as files, and found by the name under which they ship."""
 
 import contextlib
-import json
 import os
 import shutil
 import tempfile
@@ -14,10 +13,10 @@ import numpy as np
 import torch
 
 from tests.command import refused, succeeds
-from tests.data import InOneFolder
+from tests.data import InOneFolder, refuses
 from tests.toy_bank import SOUP
 from tests.toy_policy import write_policy
-from xreset import load_policy, robots, synthesize, write_demos
+from xreset import load_policy, robots
 from xreset.errors import PolicyError
 from xreset.eval.policy_spec import default_policy
 from xreset.physics.plugins import robot_folder
@@ -53,7 +52,7 @@ class OnnxPolicyTest(WithPolicy):
             ({"policy": seen.numpy()}, r"observations\['policy'\] is array"),
             ({"policy": seen, "proprio": seen[0]}, r"observations\['proprio'\] is tensor"),
         ):
-            with self.subTest(words), self.assertRaisesRegex(PolicyError, words):
+            with refuses(self, words, PolicyError):
                 policy.act(observations)
 
     def test_what_cannot_act_is_refused_before_work_begins(self):
@@ -229,12 +228,3 @@ class ShippedTest(WithPolicy):
             )
         next(shipped.FOLDER.iterdir()).unlink()
         self.assertRaisesRegex(PolicyError, f"{expected}[.]", load_policy, "skiled")
-
-    def test_it_is_evaluated_traced_and_reported_by_name(self):
-        write_demos("demos.npz", synthesize([SOUP], 1))
-        succeeds("eval", "skilled", "--demos", "demos.npz", "--episodes", "1")
-        self.assertEqual(
-            json.loads(Path("runs/skilled/eval/mujoco.json").read_text())["policy"], "skilled"
-        )
-        out = succeeds("report", "skilled")
-        self.assertTrue(Path("runs/skilled/report/index.html").is_file(), out)

@@ -13,7 +13,7 @@ from torch import tensor
 from torch.testing import assert_close
 
 from tests.command import refused, succeeds
-from tests.data import InOneFolder, data_dir
+from tests.data import InOneFolder, data_dir, refuses
 from tests.toy_retarget import FLOAT, arm_targets, box_object, check_gradient, double, hand_targets
 from tests.toy_robot import toy_motion, toy_robot
 from xreset import read_retargeted, robots, synthesize, write_retargeted
@@ -447,7 +447,7 @@ class PipelineTest(InOneFolder):
             path = self.folder / "d.npz"
             damaged = replace(self.result, **changes)
             write_npz(path, SCHEMA, arrays_of(Retargeted, damaged))
-            with self.subTest(message), self.assertRaisesRegex(FileFormatError, message):
+            with refuses(self, message, FileFormatError):
                 read_retargeted(path)
             path.unlink()
             with self.assertRaisesRegex(XResetError, f"was not written, .*{message}"):

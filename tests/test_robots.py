@@ -42,11 +42,14 @@ class Copied(InFolder):
         super().setUp()
         shutil.copytree(robot_folder("openarm"), self.folder, dirs_exist_ok=True)
 
-    def edit(self, file, old, new):
+    def edit(self, file, changes):
+        """Replace texts in a file: old -> new."""
         path = self.folder / file
         text = path.read_text()
-        self.assertIn(old, text)
-        path.write_text(text.replace(old, new))
+        for old, new in changes.items():
+            self.assertIn(old, text)
+            text = text.replace(old, new)
+        path.write_text(text)
 
 
 class BuiltIn(TestCase):
@@ -106,7 +109,7 @@ class Folder(Copied):
 class Fingerprint(Copied):
     def test_a_changed_mesh_makes_another_robot(self):
         folder = self.folder
-        self.edit("robot.urdf", '<box size="0.05 0.14 0.04" />', '<mesh filename="body.stl" />')
+        self.edit("robot.urdf", {'<box size="0.05 0.14 0.04" />': '<mesh filename="body.stl" />'})
         trimesh.creation.box((0.05, 0.14, 0.04)).export(folder / "body.stl")
         before = load(folder)
         self.assertEqual([mesh.name for mesh in before.meshes], ["body.stl"])
@@ -120,7 +123,9 @@ class Fingerprint(Copied):
 
     def test_a_robot_like_another_plays_its_policies(self):
         robot = load("openarm")
-        self.edit("robot.toml", 'name = "openarm"', f'name = "other"\nlike = "{robot.fingerprint}"')
+        self.edit(
+            "robot.toml", {'name = "openarm"': f'name = "other"\nlike = "{robot.fingerprint}"'}
+        )
         other = load(self.folder)
         task = TaskConfig()
         check_contract("p.onnx", policy_contract(robot, task, ()), other, task)
@@ -190,10 +195,15 @@ class Registry(Copied):
             self.assertIn(part, str(caught.exception))
 
     def test_every_mistake_in_a_description_is_listed(self):
-        self.edit("robot.toml", 'palm = "palm"', 'plam = "palm"')
-        self.edit("robot.toml", "home = 0.38, kp = 400.0", 'home = "0.38", kp = true')
-        self.edit("robot.toml", 'keypoint = "index4"', 'keypoint = "index5"')
-        self.edit("robot.toml", "pos = [0.45, 0.60, 0.55]", "pos = [0.45, 0.60]")
+        self.edit(
+            "robot.toml",
+            {
+                'palm = "palm"': 'plam = "palm"',
+                "home = 0.38, kp = 400.0": 'home = "0.38", kp = true',
+                'keypoint = "index4"': 'keypoint = "index5"',
+                "pos = [0.45, 0.60, 0.55]": "pos = [0.45, 0.60]",
+            },
+        )
         self.refused(
             "unknown: hand.plam; missing: hand.palm; known: name, urdf, joints, mimics, base.pos, ",
             "joints[0].home",
@@ -204,9 +214,14 @@ class Registry(Copied):
         )
 
     def test_contradictions(self):
-        self.edit("robot.toml", 'name = "thumb", link', 'name = "index", link')
-        self.edit("robot.toml", 'source = "finger_joint1"', 'source = "finger_joint9"')
-        self.edit("robot.toml", "quat = [0.38268343,", "quat = [0.5,")
+        self.edit(
+            "robot.toml",
+            {
+                'name = "thumb", link': 'name = "index", link',
+                'source = "finger_joint1"': 'source = "finger_joint9"',
+                "quat = [0.38268343,": "quat = [0.5,",
+            },
+        )
         self.refused("index occur more than once", "finger_joint9", "must be 'thumb'", "expected 1")
 
     def test_not_toml_wrong_schema_no_file(self):
@@ -217,13 +232,23 @@ class Registry(Copied):
         self.refused("robot.toml cannot be read")
 
     def test_check_tells_all_that_only_the_urdf_knows(self):
-        self.edit("robot.toml", 'name = "joint7"', 'name = "joint9"')
-        self.edit("robot.toml", "home = 1.50", "home = 2.60")
-        self.edit("robot.toml", 'wrist = "link7"', 'wrist = "link77"')
-        self.edit("robot.toml", '["link5", "link7"],', '["link5", "link8"], ["link9", "link7"],')
-        self.edit("robot.toml", "mimics = [{", "mimics = [{ multiplier = 2.0,")
-        self.edit("robot.urdf", 'ixx="0.000143"', 'ixx="-0.00143"')
-        self.edit("robot.urdf", '<mass value="0.550659" />', '<mass value="0" />')
+        self.edit(
+            "robot.toml",
+            {
+                'name = "joint7"': 'name = "joint9"',
+                "home = 1.50": "home = 2.60",
+                'wrist = "link7"': 'wrist = "link77"',
+                '["link5", "link7"],': '["link5", "link8"], ["link9", "link7"],',
+                "mimics = [{": "mimics = [{ multiplier = 2.0,",
+            },
+        )
+        self.edit(
+            "robot.urdf",
+            {
+                'ixx="0.000143"': 'ixx="-0.00143"',
+                '<mass value="0.550659" />': '<mass value="0" />',
+            },
+        )
         found = self.errors()
         for part in (
             "'joint9' is not in the URDF",
@@ -238,8 +263,13 @@ class Registry(Copied):
             self.assertIn(part, found)
 
     def test_check_names_a_driven_joint_and_a_mimic_that_are_fixed(self):
-        self.edit("robot.urdf", '"joint7" type="revolute"', '"joint7" type="fixed"')
-        self.edit("robot.urdf", '"finger_joint2" type="prismatic"', '"finger_joint2" type="fixed"')
+        self.edit(
+            "robot.urdf",
+            {
+                '"joint7" type="revolute"': '"joint7" type="fixed"',
+                '"finger_joint2" type="prismatic"': '"finger_joint2" type="fixed"',
+            },
+        )
         found = self.errors()
         for name in ("joint7", "finger_joint2"):
             self.assertIn(f"'{name}' is fixed in the URDF, whose moving joints are joint1", found)
@@ -251,8 +281,7 @@ class Registry(Copied):
     def test_check_finds_a_missing_mesh(self):
         self.edit(
             "robot.urdf",
-            '<box size="0.05 0.14 0.04" />',
-            '<mesh filename="package://a/body.stl" />',
+            {'<box size="0.05 0.14 0.04" />': '<mesh filename="package://a/body.stl" />'},
         )
         self.assertRegex(
             self.errors(), r"URDF: .*'package://a/body\.stl', which is not in its folders"
@@ -275,10 +304,15 @@ class Registry(Copied):
                     self.assertEqual(find_mesh(name, deep / "robot.urdf"), found)
 
     def test_check_finds_home_in_the_table_and_in_itself_and_drives_that_swing(self):
-        self.edit("robot.toml", "pos = [0.45, 0.60, 0.55]", "pos = [0.45, 0.60, 0.10]")
-        self.edit("robot.toml", '["link5", "link7"],', "")
-        self.edit("robot.toml", "kd = 28.3", "kd = 1.0")
-        self.edit("robot.toml", "kd = 55.3", "kd = 500.0")
+        self.edit(
+            "robot.toml",
+            {
+                "pos = [0.45, 0.60, 0.55]": "pos = [0.45, 0.60, 0.10]",
+                '["link5", "link7"],': "",
+                "kd = 28.3": "kd = 1.0",
+                "kd = 55.3": "kd = 500.0",
+            },
+        )
         self.assertRegex(self.errors(), r"lowest at -[\s\S]*link5 and link7 overlap at home")
         warnings = self.errors("warning")
         self.assertRegex(
@@ -288,7 +322,7 @@ class Registry(Copied):
 
     def test_a_robot_whose_links_may_all_touch_the_table(self):
         solid = [link.name for link in robot_tree(load(self.folder)).links if link.collisions]
-        self.edit("robot.toml", 'table_exclude = ["link0"]', f"table_exclude = {solid}")
+        self.edit("robot.toml", {'table_exclude = ["link0"]': f"table_exclude = {solid}"})
         self.assertIn(
             "home and table: no shape that may not touch the table is above it; 0 %",
             self.errors("ok"),
@@ -296,5 +330,5 @@ class Registry(Copied):
 
     def test_command_fails_on_errors_only(self):
         succeeds("robots", "check", self.folder)
-        self.edit("robot.toml", 'palm = "palm"', 'palm = "plam"')
+        self.edit("robot.toml", {'palm = "palm"': 'palm = "plam"'})
         self.assertIn("'plam'", refused("robots", "check", self.folder))

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.testing import assert_allclose
 
 from tests.command import refused, succeeds, xreset
-from tests.data import InFolder
+from tests.data import InFolder, refuses
 from tests.toy_bank import SOUP
 from tests.toy_results import swept
 from xreset.errors import XResetError
@@ -63,7 +63,7 @@ class StressedTest(TestCase):
             ("pose-delay=200", "'pose-delay=200': 200 is too much. Give s, at most 2"),
             ("action-latency=1", "1 is too much. Give s, at most 0.5"),
         ):
-            with self.subTest(text), self.assertRaisesRegex(XResetError, words):
+            with refuses(self, words, XResetError, text):
                 chosen([text])
         (late,) = chosen(["action-latency"])
         with self.assertRaisesRegex(

@@ -13,7 +13,7 @@ from unittest.mock import Mock, patch
 import numpy as np
 
 from tests.command import calls_of, succeeds
-from tests.data import InFolder, InOneFolder
+from tests.data import InFolder, InOneFolder, refuses
 from tests.toy_bank import SOUP
 from tests.toy_results import toy_result, toy_rollouts
 from xreset import synthesize, write_demos
@@ -83,7 +83,7 @@ class FileTest(Studied):
                 r"runs is 'A', expected one of 'IK Oracle'",
             ),
         ):
-            with self.subTest(message), self.assertRaisesRegex(FileFormatError, message):
+            with refuses(self, message, FileFormatError):
                 read_study(self.file(BASE + text))
         for text, message in (("schema = ", "is not valid TOML"), ("about = 'x'", none)):
             self.assertRaisesRegex(FileFormatError, message, read_study, self.file(text))
@@ -210,7 +210,7 @@ class PlanTest(Studied):
             ("[runs.a]\n[runs.a-seed0]\npolicy = 'ik'\n", RunError, "would both write .*/a-seed0"),
             ("[runs.reports]\npolicy = 'ik'\n", RunError, "would both write .*/reports"),
         ):
-            with self.subTest(message), self.assertRaisesRegex(error, message):
+            with refuses(self, message, error):
                 self.plan(BASE + text)
         with self.assertRaisesRegex(RunError, "has no runs b; it has a"):
             self.plan(BASE + "[runs.a]\n", only=("b",))
@@ -360,30 +360,28 @@ class TablesTest(Studied):
 
     def test_results_of_other_episodes_do_not_count(self):
         self.write("ik", 0.33, 0.33, 0.33, 0.33)
-        for changes, left in (
-            ("", ""),
-            ("seed = 7\n", "in mujoco"),
+
+        def step(entries):
+            return self.plan(self.TEXT.replace("episodes = 2\n", entries)).steps["eval ik"]
+
+        two = "episodes = 2\n"
+        for entries, left in (
+            (two, ""),
+            (f"{two}seed = 7\n", "in mujoco"),
             ("episodes = 3\n", "in mujoco"),
-            ("episode_seconds = 5.0\n", ""),
-            ("episode_seconds = 12.0\n", "in mujoco"),
+            (f"{two}episode_seconds = 5.0\n", ""),
+            (f"{two}episode_seconds = 12.0\n", "in mujoco"),
         ):
-            text = self.TEXT.replace(
-                "episodes = 2\n",
-                f"{changes}" if "episodes" in changes else f"episodes = 2\n{changes}",
-            )
-            self.assertEqual(self.plan(text).steps["eval ik"].left(), left)
-        short = self.TEXT.replace("episodes = 2\n", "episodes = 2\nepisode_seconds = 0.01\n")
+            self.assertEqual(step(entries).left(), left)
         with self.assertRaisesRegex(XResetError, "episode_seconds is 0.01, expected a number from"):
-            self.plan(short)
+            step(f"{two}episode_seconds = 0.01\n")
         self.write("ik", 0.33, 0.33, 0.33, 0.33, episode_seconds=12.0)
-        for seconds, left in ((None, "in mujoco"), (5.0, "in mujoco"), (12.0, "")):
-            changed = (
-                f"episodes = 2\nepisode_seconds = {seconds}\n" if seconds else "episodes = 2\n"
-            )
-            step = self.plan(self.TEXT.replace("episodes = 2\n", changed)).steps["eval ik"]
-            self.assertEqual(step.left(), left)
-            for command in step.todo()[1]:
-                self.assertEqual("--episode-seconds" in command, seconds is not None)
+        self.assertEqual(step(f"{two}episode_seconds = 12.0\n").left(), "")
+        for entries, is_passed_on in ((two, False), (f"{two}episode_seconds = 5.0\n", True)):
+            found = step(entries)
+            self.assertEqual(found.left(), "in mujoco")
+            (command,) = found.todo()[1]
+            self.assertEqual("--episode-seconds" in command, is_passed_on)
 
 
 class WholeTest(InOneFolder):
@@ -451,7 +449,7 @@ class WholeTest(InOneFolder):
                 r"was made otherwise: synthetic_per_object is 1 there and 2 in",
             ),
         ):
-            with self.subTest(message), self.assertRaisesRegex(RunError, message):
+            with refuses(self, message, RunError):
                 self.plan(change)
         self.assertEqual(latest_checkpoint(self.out / "x-reset-seed0").read_bytes(), before)
 

@@ -15,7 +15,6 @@ from torch.testing import assert_close
 from tests import toy_grasp, toy_results
 from tests.command import printed, refused, succeeds
 from tests.data import InFolder
-from tests.engine_checks import JOINT, with_drive
 from tests.toy_bank import SOUP, SPAM
 from tests.toy_grasp import recording
 from xreset import robots
@@ -51,17 +50,6 @@ def grasp_actions(steps=60):
             np.stack([toy_grasp.targets(i) for i in range(steps)]), dtype=torch.float32
         ),
     )
-
-
-def wave_actions():
-    """Every joint but the jaws steps at once, far from the object, which is on the table."""
-    actions = grasp_actions(30)
-    home = torch.as_tensor(actions.robot.home, dtype=torch.float32)
-    step = tensor([0.2 if "jaw" not in name else 0.0 for name in actions.robot.joint_names])
-    start = replace(
-        actions.start, object_pos=tensor([[0.9, 0.5, 0.02]]), object_quat=tensor([[1.0, 0, 0, 0]])
-    )
-    return replace(actions, start=start, joint_target=(home + step).expand(30, -1).clone())
 
 
 def no_force():
@@ -223,21 +211,6 @@ class TraceTest(TestCase):
         noise = tuple(replace(made, divergences=each) for each in ones)
         (worst,) = replace(self.result, noise=noise).worst_noise
         self.assertEqual((worst.time, worst.where, worst.end, worst.largest), (0.2, "at 0.2", 3, 5))
-
-    def test_half_a_drives_gain_is_found_in_its_joint_at_once(self):
-        kp = 0.5 * toy_grasp.robot().joints[JOINT["turn"]].drive.kp
-        weak = toy_grasp.with_scene(
-            self.mujoco,
-            "weak",
-            lambda scene: replace(scene, robot=with_drive(scene.robot, "turn", kp=kp)),
-        )
-        result = trace(wave_actions(), self.mujoco, [weak])
-        found = {d.quantity: d for d in result.engines[0].divergences}
-        self.assertEqual(found["joints"].where, "turn")
-        self.assertLess(found["joints"].time, 0.1)
-        self.assertFalse(result.within_noise(found["joints"]))
-        for quantity in ("object position", "object orientation", "contacts", "contact force"):
-            self.assertIsNone(found[quantity].time, quantity)
 
     def test_half_the_friction_is_found_in_the_object_and_not_in_the_joints(self):
         slippery = self.result.engines[1]

@@ -24,6 +24,7 @@ from onnx import numpy_helper
 from torch.testing import assert_close
 
 from tests.command import calls_of
+from tests.data import refuses
 from tests.toy_bank import SOUP, SPAM, toy_bank
 from tests.toy_goals import toy_goals
 from tests.toy_training import CONFIG, OPTIONS, WithBank, quickly
@@ -290,7 +291,7 @@ class TrainingTest(WithBank):
             message = (
                 f"job-again holds another training: {problem}.*Choose another folder, or .*--resume"
             )
-            with self.subTest(problem), self.assertRaisesRegex(RunError, message):
+            with refuses(self, message, RunError, problem):
                 again(**changes)
         self.assertEqual(len(checkpoints(out)), 2)
 
@@ -373,7 +374,7 @@ class TrainingTest(WithBank):
             ("x =", "is not valid TOML"),
         ):
             path.write_text(text)
-            with self.subTest(text), self.assertRaisesRegex(XResetError, problem):
+            with refuses(self, problem, XResetError, text):
                 starting_config(str(path))
         path.write_text('task.reward.terms."no_such_module:term".weight = 1.0')
         with redirect_stderr(io.StringIO()) as said:
@@ -492,15 +493,6 @@ class TrainingTest(WithBank):
         self.assertIn("is trained", said.getvalue())
         self.assertEqual(read_policy(out).content, (out / "policy.onnx").read_bytes())
         self.assertEqual(read_run(out).config, CONFIG)
-
-    def test_a_schedule_without_effect_is_refused(self):
-        config = replace(CONFIG, schedule=ScheduleConfig(teacher=((0.0, 1.0),)))
-        with self.assertRaisesRegex(RunError, "this training has no teacher"):
-            self.train("idle", config=config)
-
-    def test_a_recipe_is_not_ignored(self):
-        with self.assertRaisesRegex(XResetError, "Both recipe and config"):
-            self.train("both", recipe="minutes")
 
     def test_an_own_term_that_is_not_finite_is_named(self):
         name = f"{__name__}:not_a_number"
@@ -651,7 +643,7 @@ class TrainingTest(WithBank):
             (out, own, "is a folder or a device, expected a file .checkpoint"),
             (moved, own, "is not a run folder"),
         ):
-            with self.subTest(problem), self.assertRaisesRegex(XResetError, problem):
+            with refuses(self, problem, XResetError):
                 export_checkpoint(checkpoint, target)
         policy.write_bytes(first)
         os.utime(latest_checkpoint(out), (2e9, 2e9))  # copied: its time says nothing
@@ -670,6 +662,7 @@ class TrainingTest(WithBank):
         observation = replace(CONFIG.task.observation, perception=cloud)
         short = replace(CONFIG, task=replace(CONFIG.task, observation=observation))
         wide = replace(CONFIG, model=replace(CONFIG.model, lstm=16))
+        idle = replace(CONFIG, schedule=ScheduleConfig(teacher=((0.0, 1.0),)))
         empty = toy_bank(self.robot).with_states(np.zeros(6, dtype=bool))
         for words, options in (
             ("is not a run folder", {"weights": self.folder, "goals": toy_goals(self.robot)}),
@@ -679,6 +672,8 @@ class TrainingTest(WithBank):
             ("many-objects has no critic .* Give a run folder", {"weights": "many-objects"}),
             ("000002.pt is a file. Give the folder", {"weights": latest_checkpoint(self.out)}),
             (f"folder above has one: give {self.out}", {"weights": self.out / "checkpoints"}),
+            ("this training has no teacher", {"config": idle}),
+            ("Both recipe and config", {"recipe": "minutes"}),
             ("^num_envs is 0", {"num_envs": 0}),
             ("^minutes is 0", {"minutes": 0.0, "bank": toy_bank(self.robot)}),
             ("Unknown device 'quantum'", {"device": "quantum"}),
@@ -692,7 +687,7 @@ class TrainingTest(WithBank):
             ("no state to reset to.*demo-probability 0", {"bank": empty}),
             ("reset bank for the robot 'openarm'", {"robot": "ur7e-sharpa"}),
         ):
-            with self.subTest(words), self.assertRaisesRegex(XResetError, words):
+            with refuses(self, words, XResetError):
                 self.train("refused", **options)
             self.assertEqual(list(self.folder.glob("refused/*.npz")), [], words)
         with (
@@ -785,7 +780,7 @@ class TrainingTest(WithBank):
             (RuntimeError("cannot allocate a name"), RuntimeError, "a name"),
         ):
             broken = patch.object(TrainingRunner, "learn", side_effect=error)
-            with self.subTest(error), broken, self.assertRaisesRegex(wanted, said):
+            with broken, refuses(self, said, wanted, error):
                 self.train("memory")
 
     def test_many_worlds_on_a_cpu_are_warned_of(self):
@@ -821,7 +816,7 @@ class TrainingTest(WithBank):
         ):
             torch.save(good | {key: wrong}, file)
             words = rf"(?s){file.name}\.{key} is .*, expected "
-            with self.subTest(key), self.assertRaisesRegex(FileFormatError, words):
+            with refuses(self, words, FileFormatError, key):
                 read_checkpoint(file)
         optimizer = torch.optim.Adam([torch.zeros(2, requires_grad=True)])
         three = torch.zeros(3)
@@ -846,5 +841,5 @@ class TrainingTest(WithBank):
             ),
         ):
             self.changed_run(out, **good | changes)
-            with self.subTest(words), self.assertRaisesRegex(FileFormatError, words):
+            with refuses(self, words, FileFormatError):
                 read_run(out)

@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from numpy.testing import assert_array_equal, assert_equal
 
+from tests.data import refuses
 from tests.test_env import TASK, BreakableBackend, N, WithEnv
 from xreset import VectorEnv, XResetError
 from xreset.task.config import ResetConfig, TerminationConfig
@@ -79,8 +80,7 @@ class VectorEnvTest(WithEnv):
             [["left"] * joints] * N,
         ):
             with (
-                self.subTest(shape=np.shape(wrong)),
-                self.assertRaisesRegex(XResetError, rf"of shape \({N}, {joints}\)"),
+                refuses(self, rf"of shape \({N}, {joints}\)", XResetError, np.shape(wrong)),
             ):
                 env.step(wrong)
         for taken in (right, right.astype(int), right.tolist(), torch.zeros(N, joints)):

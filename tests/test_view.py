@@ -24,7 +24,7 @@ from websockets.typing import Subprotocol
 from tests import toy_bank
 from tests.browser import wait_until
 from tests.command import refused, succeeds
-from tests.data import InOneFolder
+from tests.data import InOneFolder, refuses
 from tests.toy_bank import SOUP, SPAM
 from tests.toy_goals import toy_goals
 from xreset import Demos, robots, write_bank, write_demos, write_goals, write_retargeted
@@ -200,7 +200,7 @@ class Data(WithFiles):
             ("for the robot 'openarm'", FileFormatError, self.bank, {"robot": "ur7e-sharpa"}),
             ("no sequence 2", XResetError, self.retargeted, {}),
         ):
-            with self.subTest(words), self.assertRaisesRegex(kind, words):
+            with refuses(self, words, kind):
                 load_view(path, **options).choose(sequence=2)
 
 

@@ -1,5 +1,6 @@
 """A small reset bank for tests, with soup and spam, three demonstrations and six states, all numbers distinct; and trajectories."""
 
+from contextlib import contextmanager
 from functools import partial
 from typing import Any
 from unittest.mock import patch
@@ -14,9 +15,15 @@ ONLY_FRAMES = {"closing": None, "squeeze": None, "transfer": None}
 """Arguments of `make_bank` for a bank of states that are frames and do not press."""
 
 
+@contextmanager
 def in_this_process():
-    """Try states without worker processes, while it is entered."""
-    return patch("xreset.resets.probe.make_backend", partial(make_backend, workers=0))
+    """Try states and make environments without worker processes."""
+    here = partial(make_backend, workers=0)
+    with (
+        patch("xreset.resets.probe.make_backend", here),
+        patch("xreset.env.manipulation.make_backend", here),
+    ):
+        yield
 
 
 def toy_bank(robot, **changes):

@@ -3,6 +3,7 @@ decides whether half the friction, or half the drive's stiffness, is still enoug
 
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 import torch
@@ -40,6 +41,16 @@ def robot():
 
 def brick():
     return objects()[0]
+
+
+def found(objects=()):
+    """Let every file find the gripper and these objects (default: the brick), while it is entered."""
+    return patch.multiple(
+        "xreset.resets.inputs",
+        load_robot=lambda _: robot(),
+        load_objects=lambda *_: objects or (brick(),),
+        object_source=lambda *_: "stand-in",
+    )
 
 
 def scene():
@@ -109,6 +120,14 @@ def bank():
         goal_pos=start_pos + np.array([0, 0, RAISED]),
         goal_quat_wxyz=np.tile(quat, (3, 1)),
     )
+
+
+def grasps(**changes):
+    """The bank with six states in which the brick is between the jaws of the robot at home; ``changes`` replace fields."""
+    pos, quat = brick_pose()
+    at_home = {"joint_pos": robot().home, "object_pos": pos, "object_quat_wxyz": quat}
+    states = {name: np.tile(row, (6, 1)).astype(np.float32) for name, row in at_home.items()}
+    return replace(bank(), **states | changes)
 
 
 def trial(task, **setting):

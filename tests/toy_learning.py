@@ -80,20 +80,9 @@ def shares(mean):
 def bank():
     """States in which the brick hangs between the jaws, which are told to close."""
     robot = toy_grasp.robot()
-    pos, quat = toy_grasp.brick_pose()
     closing = robot.home.copy()
     closing[robot.joint_names.index("jaw_a_slide")] = toy_grasp.CLOSED
-
-    def six(row):
-        return np.tile(row, (6, 1)).astype(np.float32)
-
-    return replace(
-        toy_grasp.bank(),
-        joint_pos=six(robot.home),
-        joint_target=six(closing),
-        object_pos=six(pos),
-        object_quat_wxyz=six(quat),
-    )
+    return toy_grasp.grasps(joint_target=np.tile(closing, (6, 1)).astype(np.float32))
 
 
 def random_policy(seed, backend):

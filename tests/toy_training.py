@@ -2,15 +2,14 @@
 
 import io
 from contextlib import contextmanager, redirect_stdout
-from functools import partial
 from unittest.mock import Mock, patch
 
 import numpy as np
 
 from tests.command import refused, succeeds
 from tests.data import InOneFolder
-from tests.toy_bank import toy_bank
-from xreset import TaskConfig, make_backend, robots, write_bank
+from tests.toy_bank import in_this_process, toy_bank
+from xreset import TaskConfig, robots, write_bank
 from xreset.learning.config import ModelConfig, PpoConfig, TrainConfig
 from xreset.task.config import ObservationConfig
 
@@ -47,11 +46,8 @@ class WithBank(InOneFolder):
 @contextmanager
 def quickly():
     """Leave out what takes longer than all the rest: processes for the engine, and the export at the end. Yields what is printed."""
-    in_this_process = patch(
-        "xreset.env.manipulation.make_backend", partial(make_backend, workers=0)
-    )
     without_export = patch.multiple(
         "xreset.learning.train", export_checkpoint=Mock(), _export_if_missing=Mock()
     )
-    with in_this_process, without_export, redirect_stdout(io.StringIO()) as said:
+    with in_this_process(), without_export, redirect_stdout(io.StringIO()) as said:
         yield said

@@ -14,6 +14,7 @@ from xreset.eval.play.page import Page
 from xreset.eval.play.record import write_film, write_trace
 from xreset.eval.play.session import AWAY, Session
 from xreset.eval.results import read_traces
+from xreset.geometry.urdf import link_meshes
 from xreset.physics.plugins import backend_names, backend_status
 
 
@@ -193,6 +194,29 @@ class Played(InFolder):
             page.tick()
         self.assertEqual(told.call_count, 2)
         self.session.step()
+
+    def test_another_robot_begins_with_its_own_policy_and_shape(self):
+        from xreset.eval.play.page import Page
+
+        page = Page(self.session, port=8965)
+        self.addCleanup(page.close)
+        self.addCleanup(self.session.choose_policy, "many-objects")
+        for robot, name in (
+            ("openarm", "zero"),
+            ("panda-allegro", "panda-allegro"),
+            ("ur7e-sharpa", "many-objects"),
+        ):
+            with self.subTest(robot):
+                page._robot_name.value = robot
+                page._open_chosen()
+                spec = self.session.policy.robot
+                self.assertEqual((spec.name, self.session.policy.name), (robot, name))
+                self.assertEqual(set(page._robot.links), set(link_meshes(spec)))
+                self.assertEqual(page._policy.value, name)
+                self.steps(0.5)
+                targets = [moment.joint_target for moment in self.session.history]
+                self.assertEqual(np.shape(targets)[1], len(spec.joints))
+                self.assertEqual(bool(np.ptp(targets, axis=0).any()), name != "zero")
 
     def test_film_and_trace(self):
         session = self.session

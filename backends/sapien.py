@@ -8,6 +8,8 @@ What differs from SAPIEN's defaults, and why:
   coefficient. Robots touch tables of their own and copies of their links, whose materials make up the difference.
   Torsional friction is mu times ``min_patch_radius``, so that radius is torsional / mu. PhysX omits it where a patch
   has two points and lets half of the sliding friction act at each (``docs/sim-to-sim.md``).
+- Tendons couple mimic joints. They are soft and act on the links above, too (``sapien_robot``), or a jaw of coupled
+  joints would press 2.6 times too hard.
 - The robot feels no gravity (if it is compensated), nor does the object, whose weight is part of its force.
 - PhysX reports the normal forces of contacts only; friction is computed from the object's momentum
   (:func:`~xreset.backends.rigid.friction_forces`).
@@ -82,7 +84,9 @@ class SapienWorld(World):
             self._bodies = self._add_robot()
             self._object = self._add_object(scene.objects[object_index].pieces)
         self._renew_scene()
-        self._joints = SapienJoints(self._bodies, robot, scene.timestep)
+        self._joints = SapienJoints(
+            self._bodies, robot, scene.timestep, scene.timestep / _POSITION_ITERATIONS
+        )
         self._tracked = TrackedLinks(robot)
         self.set_friction(np.array([scene.friction.tip, scene.friction.link, scene.friction.table]))
         self._quat = np.array([1.0, 0.0, 0.0, 0.0])

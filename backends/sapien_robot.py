@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from xreset.backends.rigid import Mechanism, MovingJoints
+from xreset.backends.rigid import Mechanism, MovingJoints, rotate
 from xreset.errors import RobotError, XResetError
 from xreset.geometry.dynamics import mass_matrix
 from xreset.spec import MimicSpec
@@ -16,7 +16,7 @@ from xreset.spec import MimicSpec
 class SapienJoints:
     """Drives, dry friction and mimic couplings of the articulation. PhysX keeps the joints in an order of its own."""
 
-    def __init__(self, links: Sequence[Any], robot: Mechanism, dt: float) -> None:
+    def __init__(self, links: Sequence[Any], robot: Mechanism, dt: float, substep: float) -> None:
         spec = robot.robot
         self._dt = dt
         self._articulation = articulation = links[0].articulation
@@ -41,7 +41,7 @@ class SapienJoints:
         self._share = np.abs(np.stack((share / rate, share / rate, share)))
         """[3, J + Q] of stiffness, damping and effort limit."""
         for mimic in spec.mimics:
-            _couple(articulation, joints, mimic)
+            _couple(articulation, joints, mimic, substep)
 
         self.target = spec.home
         """[J] drive targets."""
@@ -97,11 +97,15 @@ class SapienJoints:
         self._articulation.qf = torque
 
 
-_TENDON_STIFFNESS = 1e5
-_TENDON_DAMPING = 1e2
+_SOFT = 0.1
+"""Stiffness of a coupling times h^2, and its damping times h, over the inertia that it holds; h: the solver's substep.
+
+PhysX divides a tendon's force on each joint by 1 plus these numbers, with the joint's own inertia. Where they are
+large, the forces on two joints have the ratio of the joints' inertias, and a coupling makes work.
+"""
 
 
-def _couple(articulation: Any, joints: Mapping[str, Any], mimic: MimicSpec) -> None:
+def _couple(articulation: Any, joints: Mapping[str, Any], mimic: MimicSpec, substep: float) -> None:
     """Tie a mimic joint to its source: a fixed tendon keeps q_mimic - multiplier q_source = offset and acts on both.
 
     It runs through the links between the two, whose own joints it does not act on.
@@ -118,23 +122,53 @@ def _couple(articulation: Any, joints: Mapping[str, Any], mimic: MimicSpec) -> N
             between.append(link)
             link = link.parent
         if link is not None:
-            chain = [upper.parent_link, upper.child_link, *between[::-1], lower.child_link]
-            rates = [0.0, first, *[0.0] * len(between), last]
-            # PhysX scales the tendon's force by the inverse rates; the rates themselves jam the joints.
-            inverse = [rate and 1.0 / rate for rate in rates]
+            chain = [upper.child_link, *between[::-1], lower.child_link]
+            rates = [first, *[0.0] * len(between), last]
+            carried = chain if link == upper.child_link else chain[1:]
+            inertia = min(_own_inertia(follower[0]), _own_inertia(source[0]) / mimic.multiplier**2)
             articulation.create_fixed_tendon(
-                chain,
-                rates,
-                inverse,
+                [upper.parent_link, *chain],
+                [0.0, *rates],
+                [0.0, *rates[: -len(carried)], *_forces(carried, rates[-len(carried) :])],
                 rest_length=mimic.offset,
-                stiffness=_TENDON_STIFFNESS,
-                damping=_TENDON_DAMPING,
+                stiffness=_SOFT * inertia / substep**2,
+                damping=_SOFT * inertia / substep,
             )
             return
     raise RobotError(
         f"The joint {mimic.joint!r} mimics {mimic.source!r}, but neither is below the other's parent link: "
         "the engine 'sapien' cannot couple them. Use another engine."
     )
+
+
+def _own_inertia(joint: Any) -> float:
+    """Return the least inertia that a joint moves: mass, or smallest moment of its own link [kg or kg m^2]."""
+    link = joint.child_link
+    own = link.mass if joint.type == "prismatic" else link.inertia.min()
+    return float(own + joint.armature.sum())
+
+
+def _forces(chain: Sequence[Any], rates: Sequence[float]) -> list[float]:
+    """Return the forces of a tendon on links, each the parent of the next, that act on their joints as the rates say.
+
+    PhysX lets a tendon act on a link without a reaction on the link's parent, so a torque on a link turns the joints
+    above it, too. Joints that slide and joints that turn are taken as independent of each other.
+    """
+    axes = [_axis(link) for link in chain]
+    forces = np.zeros(len(chain))
+    for i in reversed(range(len(chain))):
+        passed_on = forces @ [
+            float(axes[i] @ axis) if link.joint.type == chain[i].joint.type else 0.0
+            for link, axis in zip(chain, axes, strict=True)
+        ]
+        forces[i] = rates[i] - passed_on
+    return forces.tolist()
+
+
+def _axis(link: Any) -> np.ndarray:
+    """[3] world axis of the joint that carries a link; PhysX turns and slides along x."""
+    pose = link.entity_pose * link.joint.pose_in_child
+    return rotate(pose.q.astype(float), np.array([1.0, 0.0, 0.0]))
 
 
 # Which shapes collide -------------------------------------------------------------------------------------------------

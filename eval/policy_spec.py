@@ -195,7 +195,7 @@ def load_policy(
         policy: run folder, one of its checkpoints (.pt), exported or deployed policy (.onnx), folder of a deployed one
             (``docs/live.md``), name of a policy that ships with xreset, name of a robot for which one ships, or one of
             :data:`BASELINES`. A loaded policy is returned as it is; ``robot`` must be its own then.
-        robot: name or folder of the robot; default: the policy's own. Baselines need it.
+        robot: name or folder of the robot; default: the policy's own, or the first of several. Baselines need it.
         seed: seed of the baseline ``random``.
 
     Raises:
@@ -229,12 +229,15 @@ def load_policy(
             f"{found.path} has the joints {', '.join(contract.joint_names)}, but the robot {spec.name!r} has "
             f"{', '.join(spec.joint_names)}."
         )
+    results = found.results
+    if contract.task.joint_slots is not None and spec.name != contract.robot:
+        results = results / spec.name  # not in place of the results of the policy's first robot
     return PolicySpec(
         name=found.folder_name if is_graph else found.name,
         start=start,
         robot=spec,
         task=contract.task,
-        folder=found.results / "eval",
+        folder=results / "eval",
         meshes=Path(run.meshes) if run and run.meshes else None,
         objects=contract.objects,
         hash=sha256(found.content).hexdigest(),

@@ -371,8 +371,12 @@ def run_facts(run: dict[str, Any], file: Path) -> dict[str, str]:
         raise FileFormatError(
             f"{file} lacks {', '.join(wrong)}, or holds it as another type. Train again, or leave this run out."
         )
+    robots = [f"{run['robot']} ({str(contract.get('robot_fingerprint'))[:8]})"]
+    others = run.get("others")
+    if isinstance(others, list):
+        robots += [str(each.get("robot")) for each in others if isinstance(each, dict)]
     return {
-        "robot": f"{run['robot']} ({str(contract.get('robot_fingerprint'))[:8]})",
+        "robot": ", ".join(robots),
         "objects": ", ".join(map(short_name, names or ())) or "-",
         "meshes": "stand-ins" if run.get("meshes") is None else "meshes",
         "bank": f"{Path(run['resets']).name} ({run['resets_hash'][:8]})",

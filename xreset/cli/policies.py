@@ -15,7 +15,7 @@ def policies() -> None:
         about = card(file)
         console.print(f"{name}: {about.about}")
         facts = {
-            "robot": _robot(contract.robot, name),
+            "robot": ", ".join([_robot(contract.robot, name), *contract.others]),
             "objects": _objects(contract.objects),
             "data": about.data,
             "recipe": about.recipe,

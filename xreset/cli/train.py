@@ -54,7 +54,10 @@ def command_for(arguments: list[str]) -> Callable[..., None]:
         )  # the configuration has a help of its own
 
     def prepare(options: dict[str, Any]) -> None:
-        """Leave out what the configuration holds already, and a configuration that nobody gave."""
+        """Leave out what the configuration holds already, and a configuration that nobody gave. Unpack one bank."""
+        banks = options.get("bank", ())
+        if len(banks) == 1:
+            options["bank"] = banks[0]
         if given.resume:
             options["config"] = options["config"] if changes else None
         else:

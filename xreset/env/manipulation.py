@@ -35,6 +35,7 @@ from xreset.task.config import TaskConfig
 from xreset.task.default import TASK
 from xreset.task.reading import Reading, step_log
 from xreset.task.rewards import Reward, RewardFunction, RewardInput
+from xreset.task.slots import Slots
 from xreset.task.terminations import out_of_bounds
 from xreset.task.variation import Variation
 from xreset.task.worlds import Worlds
@@ -46,11 +47,9 @@ if TYPE_CHECKING:
     from xreset.task.vision import Vision
 
 
-def _check_shape(name: str, value: Tensor, like: Tensor) -> None:
-    if value.shape != like.shape:
-        raise XResetError(
-            f"{name} has the shape {tuple(value.shape)}, expected {tuple(like.shape)}."
-        )
+def _check_shape(name: str, value: Tensor, expected: tuple[int, ...]) -> None:
+    if value.shape != expected:
+        raise XResetError(f"{name} has the shape {tuple(value.shape)}, expected {expected}.")
 
 
 def make_scene(robot: RobotSpec, objects: tuple[ObjectSpec, ...], task: TaskConfig) -> SceneSpec:
@@ -110,7 +109,7 @@ class ManipulationEnv:
 
     Attributes:
         num_envs: N.
-        num_actions: J.
+        num_actions: J, or the slots of a policy for several robots (``task.joint_slots``).
         max_episode_length: control steps until the time limit.
         goal_pos: [N, 3] goal position of each world, world frame [m].
         goal_quat: [N, 4] goal orientation of each world.
@@ -124,6 +123,7 @@ class ManipulationEnv:
         variation: differences between the worlds, such as masses and delays.
         tracked_pose: position [N, 3] and orientation [N, 4] of the object, as the tracker reports them in this step.
         vision: the cameras; None: the task has none.
+        slots: slots of the robot's joints and fingertips; None: the task has none.
     """
 
     def __init__(
@@ -140,13 +140,15 @@ class ManipulationEnv:
         self.backend = backend
         self.task = task
         self._reward_function = RewardFunction(task.reward)
-        self._observer = obs.Observer(task.observation)
+        self.slots = Slots.of(backend.scene.robot, task.joint_slots, backend.device)
+        self._observer = obs.Observer(task.observation, self.slots)
         self.resets = resets
         self.cfg = task  # rsl-rl's name of the configuration
         self.device = backend.device
         scene = backend.scene
         self.num_envs = backend.num_worlds
-        self.num_actions = len(scene.robot.joints)
+        robot = scene.robot
+        self.num_actions, _ = task.sizes(len(robot.joints), len(robot.fingertips))
         steps = round(task.termination.episode_seconds / scene.control_dt)
         self.max_episode_length = max(1, steps)
         self.generator = torch.Generator(device=self.device)
@@ -185,6 +187,8 @@ class ManipulationEnv:
         self.worlds = Worlds(self.num_envs, self.device)
         keep = self.worlds.keep
         zeros = self.worlds.zeros
+        robot = self.backend.scene.robot
+        joints = len(robot.joints)
         no_world = zeros().bool()
         # Only the shapes of this draw are used. Another generator draws it, so that episodes do not depend on it.
         unused = torch.Generator(device=self.device)
@@ -199,7 +203,7 @@ class ManipulationEnv:
         self.bank_state = self._episode.state
         self._target = self._episode.joint_target
         self._episode_length = keep("episode_length", zeros().long())
-        self._previous_action = keep("previous_action", zeros(self.num_actions))
+        self._previous_action = keep("previous_action", zeros(joints))
         self._best_reach = keep("best_reach", zeros())
         """[N] smallest mean distance of the fingertips to the object in the episode [m]."""
         self._reward = keep("reward", zeros())
@@ -211,8 +215,8 @@ class ManipulationEnv:
         self.nonfinite_count = torch.zeros((), dtype=torch.long, device=self.device)
         self.overflow_count = self.nonfinite_count.clone()
         # What follows is written anew in each step.
-        self._action = zeros(self.num_actions)
-        self._sent_target = zeros(self.num_actions)
+        self._action = zeros(joints)
+        self._sent_target = zeros(joints)
         """[N, J] joint targets that reach the drives: late, lost or pushed (``variation``)."""
         self._time_out = no_world.clone()
         """[N] bool: the episode ends now, and not because the object is out of bounds."""
@@ -221,8 +225,8 @@ class ManipulationEnv:
         self._reset_mask = no_world.clone()
         """[N] bool: the world is reset now, or its episode has just begun."""
         task = self.task
-        tips = len(self.backend.scene.robot.fingertips)
-        layout = obs.layout(self.num_actions, tips, task.observation)
+        sizes = task.sizes(joints, len(robot.fingertips))
+        layout = obs.layout(*sizes, task.observation)
         width = sum(layout["proprio"].values())
         self.variation = Variation(
             self.worlds, self.backend, task.randomization, self.actions.is_arm, width
@@ -285,7 +289,7 @@ class ManipulationEnv:
             XResetError: action or begin is not a tensor, or has another shape.
         """
         if begin is not None:
-            _check_shape("begin", begin, self._reset_mask)
+            _check_shape("begin", begin, (self.num_envs,))
         self._apply_action(action)
         self._graphs.run(self._compute_rewards)
         reward = self._reward.clone()
@@ -319,7 +323,7 @@ class ManipulationEnv:
             XResetError: action or push is not a tensor, or has another shape.
         """
         if push is not None:
-            _check_shape("push", push, self._action)
+            _check_shape("push", push, tuple(self._action.shape))
         self._apply_action(action, push)
         reading, reward = self._compute_rewards()
         self._reset_mask.zero_()
@@ -411,7 +415,9 @@ class ManipulationEnv:
             raise XResetError(
                 f"The actions are a {type(action).__name__}, expected a tensor: torch.as_tensor(actions)."
             )
-        _check_shape("action", action, self._action)
+        _check_shape("action", action, (self.num_envs, self.num_actions))
+        if self.slots is not None:
+            action = action[:, self.slots.of_joint]
         self._action.copy_(action.detach())
         self._graphs.run(self._process_action)
         target = self._sent_target if push is None else self._sent_target + push
@@ -565,6 +571,8 @@ class ManipulationEnv:
             "perception": self._cloud,
             "privileged": observed("privileged", x),
         }
+        if self.slots is not None:
+            groups["action_mask"] = self.slots.mask.expand(self.num_envs, -1)
         if self.vision is not None:
             groups["goal"] = observed("goal", x)
             groups["view"] = self.vision.observe(self._reset_mask, self.generator)

@@ -80,7 +80,7 @@ def exported_checkpoint(checkpoint: Path, run: RunInfo) -> bytes:
     example = TensorDict(
         {name: torch.zeros(1, *shape) for name, shape in shapes.items()}, batch_size=[1]
     )
-    actor = make_actor(example, len(run.contract.joint_names), run.config)
+    actor = make_actor(example, run.contract.num_actions, run.config)
     with must_fit(checkpoint):
         actor.load_state_dict(weights)
     return exported(actor, run.contract, checkpoint=checkpoint)

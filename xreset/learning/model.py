@@ -16,6 +16,7 @@ from typing import Any
 import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
+from torch.distributions import Normal
 
 from xreset.errors import needs
 from xreset.learning.config import ModelConfig, TrainConfig
@@ -27,6 +28,9 @@ with needs("rsl-rl-lib", "train"):
 
 CONV = (16, 32, 32)
 """Channels of the convolutions for depth images, each of which halves the image."""
+CLIP_OBSERVATIONS = 5.0
+"""Limit of normalized observations in policies for several robots. An observation that is constant in the training,
+such as an empty slot, has almost no deviation: in another robot, its value may be a hundred deviations away."""
 LstmState = tuple[Tensor, Tensor]
 """Hidden and cell state of the LSTM, each [1, N, lstm]."""
 
@@ -158,9 +162,20 @@ class Trunk(nn.Module):
         pointnet: PointNet | ImageEncoder,
         embedding_dim: int,
         lstm_dim: int,
+        *,
+        clip: bool = False,
     ) -> None:
-        """Build normalization, LSTM and layer norm; ``embedding_dim`` is the width of all embeddings of a step."""
+        """Build normalization, LSTM and layer norm.
+
+        Args:
+            flat_dim: D.
+            pointnet: encoder of clouds or images.
+            embedding_dim: width of all embeddings of a step.
+            lstm_dim: units of the LSTM.
+            clip: whether normalized observations are limited to +-:data:`CLIP_OBSERVATIONS`.
+        """
         super().__init__()
+        self.clip = clip
         self.normalizer = EmpiricalNormalization(flat_dim)
         self.pointnet = pointnet
         self.lstm = nn.LSTM(flat_dim + embedding_dim, lstm_dim)
@@ -172,9 +187,10 @@ class Trunk(nn.Module):
         It already has the precision of the LSTM's factors, so that later copies move half as much.
         """
         dtype = torch.bfloat16 if self.pointnet.use_bfloat16 and flat.is_cuda else flat.dtype
-        return torch.cat(
-            (self.normalizer(flat).to(dtype), embeddings.flatten(-2).to(dtype)), dim=-1
-        )
+        flat = self.normalizer(flat)
+        if self.clip:
+            flat = flat.clamp(-CLIP_OBSERVATIONS, CLIP_OBSERVATIONS)
+        return torch.cat((flat.to(dtype), embeddings.flatten(-2).to(dtype)), dim=-1)
 
     def forward(self, flat: Tensor, cloud: Tensor, state: LstmState) -> tuple[Tensor, LstmState]:
         """One step for N worlds: [N, D], [N, H, P, K], LSTM state of [1, N, lstm] each -> [N, lstm], new state."""
@@ -183,7 +199,21 @@ class Trunk(nn.Module):
 
 
 class Gaussian(GaussianDistribution):
-    """rsl-rl's, but sampling does not wait for the GPU: torch's ``normal`` checks that every deviation is positive."""
+    """rsl-rl's, but sampling does not wait for the GPU: torch's ``normal`` checks that every deviation is positive.
+
+    Attributes:
+        mask: [..., A] 1 for the actions that a robot has, else 0; None: it has all. The others have mean 0 and
+            deviation 1, whatever the network says, so that neither probabilities nor gradients depend on them.
+    """
+
+    mask: Tensor | None = None
+
+    def update(self, mlp_output: Tensor) -> None:
+        """Take means."""
+        super().update(mlp_output)
+        if self.mask is not None:
+            std = torch.where(self.mask > 0, self.std, 1.0)
+            self._distribution = Normal(self.mask * self.mean, std)
 
     def sample(self) -> Tensor:
         """[..., J]"""
@@ -209,6 +239,7 @@ class PointNetLstmModel(MLPModel):
         *,
         conv: Sequence[int] = (),
         stochastic: bool = False,
+        clip: bool = False,
     ) -> None:
         """Build the model.
 
@@ -219,6 +250,7 @@ class PointNetLstmModel(MLPModel):
             config: widths of the layers.
             conv: channels of the convolutions for images; empty: the last group has clouds.
             stochastic: whether the outputs are the means of a Gaussian.
+            clip: as for :class:`Trunk`.
         """
         gaussian = {"class_name": Gaussian, "init_std": config.initial_std, "std_type": "log"}
         *flat, self.cloud_group = groups
@@ -239,8 +271,21 @@ class PointNetLstmModel(MLPModel):
         else:
             encoder = PointNet(config.pointnet, shape[2])
             width *= shape[0]
-        self.trunk = Trunk(self.obs_dim, encoder, width, config.lstm)
+        self.trunk = Trunk(self.obs_dim, encoder, width, config.lstm, clip=clip)
         self.state: LstmState | None = None
+
+    def forward(self, obs: TensorDict, *args: Any, **options: Any) -> Tensor:
+        """[..., outputs]; an actor's actions are masked by the observation ``action_mask``, if there is one."""
+        if isinstance(self.distribution, Gaussian):
+            self.distribution.mask = obs.get("action_mask", None)
+        return super().forward(obs, *args, **options)
+
+    def mean_std(self) -> Tensor:
+        """[] mean standard deviation of the actions that robots have, in the last batch."""
+        assert isinstance(self.distribution, Gaussian)
+        std = self.output_std.detach()
+        mask = self.distribution.mask
+        return std.mean() if mask is None else std[mask > 0].mean()
 
     def get_latent(
         self, obs: TensorDict, masks: Tensor | None = None, hidden_state: HiddenState = None
@@ -378,7 +423,13 @@ def make_actor(obs: TensorDict, num_actions: int, config: TrainConfig) -> PointN
     vision = config.task.vision
     conv = CONV if vision.cameras and vision.view == "depth" else ()
     actor = PointNetLstmModel(
-        obs, config.task.policy_groups, num_actions, config.model, conv=conv, stochastic=True
+        obs,
+        config.task.policy_groups,
+        num_actions,
+        config.model,
+        conv=conv,
+        stochastic=True,
+        clip=config.task.joint_slots is not None,
     )
     actor.trunk.pointnet.use_bfloat16 = config.ppo.precision == "bfloat16"
     return actor
@@ -393,6 +444,7 @@ def make_critic(obs: TensorDict, config: TrainConfig) -> PointNetLstmModel:
         ("policy", "proprio", "privileged", "perception"),
         1,
         replace(m, mlp=m.critic_mlp or m.mlp),
+        clip=config.task.joint_slots is not None,
     )
     critic.trunk.pointnet.use_bfloat16 = config.ppo.precision == "bfloat16"
     return critic

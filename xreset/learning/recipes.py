@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 import sys
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import reduce
 from pathlib import Path
@@ -18,6 +18,7 @@ from xreset.files.storage import read_toml
 from xreset.files.text import plain, shown
 from xreset.learning.config import TrainConfig
 from xreset.learning.run import read_run
+from xreset.spec import RobotSpec
 from xreset.task.config import TaskConfig
 
 
@@ -138,6 +139,30 @@ def from_home(config: TrainConfig) -> TrainConfig:
     """Return the configuration for goals without demonstrated states: every episode begins at home."""
     reset = replace(config.task.reset, demo_probability=0.0)
     return replace(config, task=replace(config.task, reset=reset))
+
+
+def for_robots(config: TrainConfig, robots: Sequence[RobotSpec]) -> TrainConfig:
+    """Return the configuration for a policy of several robots: slots that each of them fits into, and observations that
+    describe the robot. A configuration that has slots stays as it is.
+
+    Raises:
+        RobotError: a robot does not fit into slots.
+    """
+    from xreset.task.slots import check_fits, needed_slots
+
+    slots = config.task.joint_slots
+    if slots is not None:
+        for robot in robots:
+            check_fits(robot, slots)
+        return config
+    observation = config.task.observation
+    proprio = observation.proprio | {"joint_mask": {}, "joint_pos_limits": {}, "tip_mask": {}}
+    task = replace(
+        config.task,
+        observation=replace(observation, proprio=proprio),
+        joint_slots=needed_slots(robots),
+    )
+    return replace(config, task=task)
 
 
 def own_terms_flags(own: Mapping[str, Mapping[str, Any]]) -> str:

@@ -15,7 +15,7 @@ import os
 from collections.abc import Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 from xreset.errors import RunError
 from xreset.files.checks import Checked, NonNegativeInt, PositiveInt, from_dict, frozen
@@ -29,8 +29,20 @@ from xreset.task.contract import Contract
 SCHEMA = "xreset-run/1"
 TEACHER = "teacher.onnx"
 """File of the teacher's policy in the run folder of a distillation."""
+T = TypeVar("T", "RunInfo", "RobotData")
 ENOUGH = 0.97
 """Share of the minutes from which a training counts as done, because a new start would take longer than the rest."""
+
+
+@frozen
+class RobotData(Checked):
+    """Another robot of a training, and where its episodes begin."""
+
+    robot: str
+    resets: str
+    resets_hash: str
+    meshes: str | None
+    """As in :class:`RunInfo`."""
 
 
 @frozen
@@ -64,6 +76,8 @@ class RunInfo(Checked):
     """SHA-256 of the checkpoint."""
     teacher: str | None = None
     """Name of the policy that a distillation learns from; it is copied to ``teacher.onnx``. None: the rewards teach."""
+    others: tuple[RobotData, ...] = ()
+    """The other robots of a policy for several."""
     lift: Lift = Lift()
     """When success from home passed its marks, and how far the training has come."""
 
@@ -97,13 +111,19 @@ def read_run(folder: str | Path, *, as_stated: bool = False) -> RunInfo:
     info = from_dict(RunInfo, data, where, version)
     if as_stated:
         return info
+    others = tuple(_with_paths(other, folder) for other in info.others)
+    return replace(_with_paths(info, folder), others=others)
+
+
+def _with_paths(data: T, folder: Path) -> T:
+    """Return a run's description with the paths as they are from here."""
     found = {}
     for name in ("robot", "resets", "meshes"):
-        path = getattr(info, name)
+        path = getattr(data, name)
         if path and path not in robot_names() and not os.path.exists(path):
             places = (above / path for above in folder.resolve().parents)
             found[name] = str(next(filter(os.path.exists, places), path))
-    return replace(info, **found)
+    return replace(data, **found)
 
 
 def flat(data: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:

@@ -18,6 +18,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from xreset.env.manipulation import ManipulationEnv
+from xreset.env.several import SeveralEnvs
 from xreset.errors import RunError
 from xreset.learning.checkpoint import (
     Checkpoint,
@@ -57,7 +58,7 @@ class TrainingRunner:
 
     def __init__(
         self,
-        env: ManipulationEnv,
+        env: ManipulationEnv | SeveralEnvs,
         config: TrainConfig,
         folder: Path,
         *,
@@ -184,7 +185,7 @@ class TrainingRunner:
             return obs
         scalars = {f"loss/{name}": value for name, value in losses.items()}
         scalars |= {
-            "policy/std": float(self.alg.get_policy().output_std.detach().mean()),
+            "policy/std": float(self.alg.networks["actor"].mean_std()),
             "policy/learning_rate": self.alg.learning_rate,
             "speed/env_steps_per_second": steps / (learned - start),
             "speed/collect_seconds": collected - start,

@@ -42,12 +42,13 @@ def load_teacher(path: Path) -> PointNetLstmModel:
         model = PointNetLstmModel(
             observations,
             list(shapes),
-            len(policy.contract.joint_names),
+            policy.contract.num_actions,
             ModelConfig(
                 pointnet=_widths(weights, "trunk.pointnet.mlp."),
                 lstm=weights["trunk.lstm.weight_hh_l0"].shape[1],
                 mlp=_widths(weights, "mlp.")[:-1],
             ),
+            clip=policy.contract.task.joint_slots is not None,
         )
         model.load_state_dict(model.state_dict() | weights)
         model.eval()

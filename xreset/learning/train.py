@@ -22,6 +22,7 @@ from xreset.cameras.config import (
     check_each_once,
 )
 from xreset.env.manipulation import make_env
+from xreset.env.several import SeveralEnvs
 from xreset.errors import PolicyError, RunError, Stopped, XResetError
 from xreset.files.storage import claim_folder, file_hash, write_whole
 from xreset.files.text import shown
@@ -47,6 +48,7 @@ from xreset.policy.shipped import shipped_name
 from xreset.resets.bank import ResetBank, read_bank, write_bank
 from xreset.resets.goals import GoalSet, read_goals, with_goals, write_goals
 from xreset.resets.inputs import Inputs, load_inputs
+from xreset.spec import RobotSpec
 from xreset.task.rewards import RewardFunction
 
 
@@ -79,6 +81,7 @@ def refuse_changes(
     config: TrainConfig | None,
     bank: str | Path | ResetBank | None,
     goals: str | Path | GoalSet | None,
+    others: Sequence[str | Path] = (),
 ) -> None:
     """Refuse to resume a run with other options than it was started with.
 
@@ -89,6 +92,7 @@ def refuse_changes(
         config: configuration, of which only the user's own reward terms may differ from the default or the run's.
         bank: reset bank.
         goals: goal set.
+        others: reset banks of other robots.
 
     Raises:
         RunError: an option differs; the message names the first.
@@ -108,6 +112,12 @@ def refuse_changes(
     given: dict[str, tuple[Any, Any]] = {}
     for name, value in started.items():
         given[name] = (value, getattr(info, name))
+    expected_others = [other.resets_hash for other in info.others]
+    if bank is not None and list(map(file_hash, others)) != expected_others:
+        raise RunError(
+            f"{out} was started with {1 + len(info.others)} reset banks, which are not these {1 + len(others)}. "
+            f"Omit resets, or {another}"
+        )
     # A run with both a bank and a goal set has joined them in a file of its own with another hash.
     is_joined = Path(info.resets).resolve().parent == out.resolve()
     if not (is_joined and bank is not None and goals is not None):
@@ -156,6 +166,7 @@ def _identity(info: RunInfo, teacher: str | None) -> dict[str, Any]:
         "device": info.device,
         "num_envs": info.num_envs,
         "seed": info.seed,
+        "hashes of the other banks": [other.resets_hash for other in info.others],
         "hash of the weights": info.weights_hash,
         "hash of the teacher": teacher,
     } | config
@@ -206,14 +217,17 @@ def resume(
             with _claimed(out):
                 _export_if_missing(out)
         return out
-    inputs = load_inputs(
-        info.resets, robot=info.robot, meshes=info.meshes, accept=("bank", "goals")
-    )
-    if inputs.hash != info.resets_hash:
-        raise RunError(
-            f"{info.resets} is not the file that this run was started with. Put it back, or start a new run."
+    inputs = []
+    for data in (info, *info.others):
+        loaded = load_inputs(
+            data.resets, robot=data.robot, meshes=data.meshes, accept=("bank", "goals")
         )
-    check_contract(str(out), info.contract, inputs.robot, info.config.task)
+        if loaded.hash != data.resets_hash:
+            raise RunError(
+                f"{data.resets} is not the file that this run was started with. Put it back, or start a new run."
+            )
+        check_contract(str(out), info.contract, loaded.robot, info.config.task)
+        inputs.append(loaded)
     with _claimed(out), cleanly(out, info):
         run_training(out, info, inputs, minutes=minutes, resumed=True, wandb=wandb)
     return out
@@ -290,7 +304,7 @@ def check_config(config: TrainConfig, inputs: Inputs, *, has_teacher: bool) -> N
         )
 
 
-def checkpoint_to_start_from(run: Path, inputs: Inputs, config: TrainConfig) -> Path:
+def checkpoint_to_start_from(run: Path, robots: Sequence[RobotSpec], config: TrainConfig) -> Path:
     """Return the newest checkpoint of another run, whose networks must be like those of this run."""
     if run.suffix == ".onnx" or (not run.exists() and shipped_name(str(run))):
         raise RunError(
@@ -303,12 +317,13 @@ def checkpoint_to_start_from(run: Path, inputs: Inputs, config: TrainConfig) -> 
             f"another run (--weights), or continue the student: --out {run} --resume"
         )
     start = f"Start from its configuration, with recipe=... or --recipe {run}"
-    try:
-        check_contract(str(run), other.contract, inputs.robot, config.task)
-    except PolicyError as error:
-        if other.contract.robot != inputs.robot.name:
-            raise
-        raise PolicyError(f"{error} {start}") from error
+    for robot in robots:
+        try:
+            check_contract(str(run), other.contract, robot, config.task)
+        except PolicyError as error:
+            if other.contract.task.joint_slots is None and other.contract.robot != robot.name:
+                raise
+            raise PolicyError(f"{error} {start}") from error
     layers = config.model.layers
     differing = [name for name, value in other.config.model.layers.items() if value != layers[name]]
     if differing:
@@ -406,6 +421,7 @@ def start(
     info: RunInfo,
     data: str | Path | ResetBank,
     load: Callable[[str | Path | ResetBank], Inputs],
+    others: Sequence[Inputs],
     teacher: OnnxPolicy | None,
     *,
     minutes: float,
@@ -424,19 +440,23 @@ def start(
         inputs = load(data)
         info = replace(info, resets=str(inputs.path), resets_hash=str(inputs.hash))
         with cleanly(out, info):
-            run_training(out, info, inputs, minutes=minutes, resumed=False, wandb=wandb)
+            all_inputs = (inputs, *others)
+            run_training(out, info, all_inputs, minutes=minutes, resumed=False, wandb=wandb)
 
 
 def run_training(
     out: Path,
     info: RunInfo,
-    inputs: Inputs,
+    inputs: Sequence[Inputs],
     *,
     minutes: float,
     resumed: bool,
     wandb: str | None,
 ) -> None:
-    """Train from the newest checkpoint, from the networks of ``weights`` or from new ones, and export the policy."""
+    """Train from the newest checkpoint, from the networks of ``weights`` or from new ones, and export the policy.
+
+    Several robots, each of which has inputs, share the worlds evenly.
+    """
     processes = Processes.of_environment()
     device = processes.device(info.device)
     newest = latest_checkpoint(out) if resumed and checkpoints(out) else None
@@ -445,16 +465,21 @@ def run_training(
     if device.startswith("cuda:"):
         torch.cuda.set_device(device)
     torch.manual_seed(seed)
-    with make_env(
-        inputs.robot,
-        inputs.objects,
-        inputs.bank,
-        info.config.task,
-        engine=info.engine,
-        num_envs=info.num_envs,
-        device=device,
-        seed=seed,
-    ) as env:
+    with ExitStack() as stack:
+        envs = []
+        for i, each in enumerate(inputs):
+            env = make_env(
+                each.robot,
+                each.objects,
+                each.bank,
+                info.config.task,
+                engine=info.engine,
+                num_envs=(info.num_envs + i) // len(inputs),
+                device=device,
+                seed=seed + i,
+            )
+            envs.append(stack.enter_context(env))
+        env = envs[0] if len(envs) == 1 else SeveralEnvs(envs)
         if env.vision is not None:
             env.vision.check_sees_objects()
         teacher = out / TEACHER if info.teacher else None

@@ -17,13 +17,15 @@ from xreset.errors import RunError, XResetError
 from xreset.files.checks import Option, Output, PositiveInt, Seed, obeys_rules
 from xreset.files.storage import file_hash
 from xreset.learning.config import TrainConfig
-from xreset.learning.recipes import default_config, from_home, starting_config
-from xreset.learning.run import RunInfo, checkpoints, read_run
+from xreset.learning.recipes import default_config, for_robots, from_home, starting_config
+from xreset.learning.run import RobotData, RunInfo, checkpoints, read_run
 from xreset.physics.plugins import Device, backend_class, device_for
 
 if TYPE_CHECKING:
     from xreset.resets.bank import ResetBank
     from xreset.resets.goals import GoalSet
+    from xreset.resets.inputs import Inputs
+    from xreset.spec import RobotSpec
 else:  # a command has files in place of these
     ResetBank = GoalSet = Any
 
@@ -33,7 +35,7 @@ _WORLDS_OF_STUDENT = 1024
 
 @obeys_rules
 def train(
-    bank: Annotated[str | Path | ResetBank | None, Option("resets")] = None,
+    bank: Annotated[str | Path | ResetBank | Sequence[str | Path] | None, Option("resets")] = None,
     *,
     out: Output,
     robot: str | Path | None = None,
@@ -59,7 +61,8 @@ def train(
     signal, it writes a checkpoint and exits with 128 and the signal's number: 130 after Ctrl-C, 143 after SIGTERM.
 
     Args:
-        bank: reset bank, made by xreset resets. Without a bank, every episode begins at home.
+        bank: reset bank, made by xreset resets. Without a bank, every episode begins at home. With the banks of several
+            robots, one policy learns all of them, each in an equal share of the worlds.
         out: run folder to make, or to continue.
         robot: name or folder of the robot; default: that of the bank or of the goal set.
         goals: goal set, made by xreset goals. With a bank, its starts and goals are added to the demonstrated ones.
@@ -106,12 +109,13 @@ def train(
     from xreset.resets.inputs import load_inputs
 
     out = Path(out)
+    first, others = _first_and_others(bank, robot, goals, teacher)
     length = {"iterations": iterations, "minutes": minutes, "wandb": wandb}
     if resume:
         started = {"robot": robot, "meshes": meshes, "engine": engine, "device": device}
         started |= {"num_envs": num_envs, "seed": seed, "teacher": teacher}
         new = {"recipe": recipe, "weights": weights, "cameras": cameras or None}
-        training.refuse_changes(out, started, new, config, bank, goals)
+        training.refuse_changes(out, started, new, config, first, goals, others)
         own = config.task.reward.own if config else None
         return training.resume(out, own=own, **length)
     config = _configuration(config, recipe, weights, teacher, cameras, goals)
@@ -121,16 +125,21 @@ def train(
     engine = engine or "mujoco-warp"
     device = _device(device, engine, present)
     training.check_minutes(minutes)
-    data = training.bank_or_goals(bank, goals)
+    data = training.bank_or_goals(first, goals)
     load = partial(load_inputs, robot=robot, meshes=meshes, accept=("bank", "goals"))
     inputs = load(data)
     if isinstance(inputs.data, GoalSet):
         config = from_home(config)
-    training.check_config(config, inputs, has_teacher=teacher is not None)
+    loaded = [inputs, *map(load, others)]
+    robots = [each.robot for each in loaded]
+    if others:
+        config = for_robots(config, _different(robots))
+    for each in loaded:
+        training.check_config(config, each, has_teacher=teacher is not None)
     version = backend_class(engine).engine_version()  # fails where the engine is missing
     start = None
     if weights is not None:
-        start = training.checkpoint_to_start_from(Path(weights), inputs, config)
+        start = training.checkpoint_to_start_from(Path(weights), robots, config)
     teacher_policy = None
     if teacher is not None:
         teacher_policy = training.read_teacher(teacher, inputs, config)
@@ -146,19 +155,71 @@ def train(
         num_envs=num_envs or default_worlds,
         seed=seed or 0,
         config=config,
-        contract=policy_contract(inputs.robot, config.task, tuple(o.name for o in inputs.objects)),
+        contract=policy_contract(inputs.robot, config.task, _object_names(loaded), robots[1:]),
         weights=str(start) if start else None,
         weights_hash=file_hash(start) if start else None,
         teacher=str(teacher) if teacher else None,
+        others=tuple(map(_robot_data, loaded[1:])),
     )
     if present is None:
-        training.start(out, info, data, load, teacher_policy, minutes=minutes, wandb=wandb)
+        training.start(
+            out, info, data, load, loaded[1:], teacher_policy, minutes=minutes, wandb=wandb
+        )
         return out
     if not isinstance(data, str | Path):
         info = replace(info, resets_hash=training.hash_of(data))
     training.refuse_another_training(out, present, info, teacher_policy)
     length["iterations"] = config.iterations
     return training.resume(out, own=config.task.reward.own, **length)
+
+
+def _first_and_others(
+    bank: Any, robot: Any, goals: Any, teacher: Any
+) -> tuple[Any, Sequence[str | Path]]:
+    """Return the first of the reset banks, and those of other robots, which exclude some arguments of :func:`train`."""
+    if not isinstance(bank, list | tuple):
+        return bank, ()
+    if not bank:
+        return None, ()
+    if len(bank) == 1:
+        return bank[0], ()
+    for name, value in (("robot", robot), ("goals", goals), ("teacher", teacher)):
+        if value is not None:
+            raise RunError(
+                f"{len(bank)} reset banks and {name} are given. A policy for several robots learns each robot from "
+                f"the bank that names it. Omit {name}, or give one bank."
+            )
+    if not all(isinstance(each, str | Path) for each in bank):
+        raise RunError("Several reset banks must be files. Write them with xreset.write_bank.")
+    return bank[0], bank[1:]
+
+
+def _different(robots: Sequence[RobotSpec]) -> Sequence[RobotSpec]:
+    """Return the robots; ``RunError`` if two have the same name."""
+    names = [robot.name for robot in robots]
+    if len(set(names)) < len(names):
+        raise RunError(
+            f"The reset banks are for {', '.join(names)}, expected another robot for each. Put all demonstrations of "
+            "a robot into one bank."
+        )
+    return robots
+
+
+def _object_names(loaded: Sequence[Inputs]) -> tuple[str, ...]:
+    """Return the names of all objects of a training, those of the first robot first."""
+    names: dict[str, None] = {}
+    for each in loaded:
+        names |= dict.fromkeys(o.name for o in each.objects)
+    return tuple(names)
+
+
+def _robot_data(inputs: Inputs) -> RobotData:
+    return RobotData(
+        robot=str(inputs.robot_name),
+        resets=str(inputs.path),
+        resets_hash=str(inputs.hash),
+        meshes=str(inputs.meshes) if inputs.meshes else None,
+    )
 
 
 def _configuration(

@@ -132,4 +132,5 @@ class GraphPolicy:
         self._controller.set_goal(_array(env.goal_pos), _array(env.goal_quat))
         self._controller.target = _array(env.joint_target)
         target = torch.as_tensor(self._controller.step(reading), device=env.device)
-        return env.actions.action_for(target, env.joint_target)
+        action = env.actions.action_for(target, env.joint_target)
+        return action if env.slots is None else env.slots.joints(action)

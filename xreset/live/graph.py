@@ -26,6 +26,7 @@ from xreset.spec import RobotSpec
 from xreset.task.actions import ActionSpace
 from xreset.task.config import TaskConfig
 from xreset.task.observations import ObservationInput, Observer, cloud_shape
+from xreset.task.slots import Slots
 
 if TYPE_CHECKING:
     from onnx import ModelProto, ValueInfoProto
@@ -56,7 +57,7 @@ class Observe(nn.Module):
 
     def __init__(self, robot: RobotSpec, task: TaskConfig, state_widths: Sequence[int]) -> None:
         super().__init__()
-        self._observer = Observer(task.observation)
+        self._observer = Observer(task.observation, Slots.of(robot, task.joint_slots))
         self._links = robot.tracked_links
         self._kinematics = Kinematics(robot, dtype=torch.float32)
         actions = ActionSpace(robot, task.action)
@@ -155,14 +156,21 @@ class Act(nn.Module):
     def __init__(self, robot: RobotSpec, task: TaskConfig) -> None:
         super().__init__()
         self._actions = ActionSpace(robot, task.action)
+        self._slots = Slots.of(robot, task.joint_slots)
 
     def forward(
         self, action: Tensor, joint_pos: Tensor, joint_target: Tensor, kept: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Return the joint targets [N, J] and the memory; ``kept`` is the part of it that :class:`Observe` returns."""
+        if self._slots is not None:
+            action = action[:, self._slots.of_joint]
         action = action.clamp(-1.0, 1.0)
         target = self._actions.targets(action, joint_target, joint_pos)
         return target, torch.cat((torch.ones_like(action[:, :1]), action, kept), dim=1)
+
+
+def _num_actions(robot: RobotSpec, task: TaskConfig) -> int:
+    return task.sizes(len(robot.joints), len(robot.fingertips))[0]
 
 
 def _input_shapes(robot: RobotSpec, task: TaskConfig) -> dict[str, tuple[int, ...]]:
@@ -210,7 +218,7 @@ def policy_graph(network: bytes | nn.Module, robot: RobotSpec, task: TaskConfig)
     last = exported_module(
         Act(robot, task),
         {  # torch takes two inputs that are one tensor for one input
-            "action": torch.zeros(_EXAMPLES, len(robot.joints)),
+            "action": torch.zeros(_EXAMPLES, _num_actions(robot, task)),
             "joint_pos": zeros["joint_pos"],
             "joint_target": zeros["joint_target"],
             "kept": torch.zeros(_EXAMPLES, observe.kept),
@@ -313,7 +321,7 @@ def _exported_module(network: nn.Module, robot: RobotSpec, task: TaskConfig) -> 
     with torch.no_grad():
         flat, cloud, *_ = observe(*zeros, torch.zeros(_EXAMPLES, observe.memory))
         action = network(flat, cloud)
-    expected = (_EXAMPLES, len(robot.joints))
+    expected = (_EXAMPLES, _num_actions(robot, task))
     if not isinstance(action, Tensor) or tuple(action.shape) != expected:
         found = tuple(action.shape) if isinstance(action, Tensor) else type(action).__name__
         raise PolicyError(

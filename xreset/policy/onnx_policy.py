@@ -7,6 +7,7 @@ rate. Reading a policy needs no torch, and running it neither warp nor rsl-rl.
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import asdict, replace
 from hashlib import sha256
@@ -16,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from xreset.errors import PolicyError, WrongValueError, needs
+from xreset.errors import PolicyError, RobotError, WrongValueError, needs
 from xreset.files.checks import parsed
 from xreset.files.storage import code_version, max_bytes, parse_json
 from xreset.files.text import shown
@@ -54,10 +55,16 @@ class Policy(Protocol):
         ...
 
 
-def policy_contract(robot: RobotSpec, task: TaskConfig, objects: tuple[str, ...]) -> Contract:
-    """Return everything that must agree between training and evaluation."""
+def policy_contract(
+    robot: RobotSpec,
+    task: TaskConfig,
+    objects: tuple[str, ...],
+    others: Sequence[RobotSpec] = (),
+) -> Contract:
+    """Return everything that must agree between training and evaluation; ``others``: further robots of a training."""
     from xreset.task.observations import layout
 
+    sizes = task.sizes(len(robot.joints), len(robot.fingertips))
     return Contract(
         schema=SCHEMA,
         robot=robot.name,
@@ -65,11 +72,10 @@ def policy_contract(robot: RobotSpec, task: TaskConfig, objects: tuple[str, ...]
         joint_names=robot.joint_names,
         fingertip_names=robot.fingertip_names,
         objects=objects,
-        observation_layout=layout(
-            len(robot.joints), len(robot.fingertips), task.observation, task.vision
-        ),
+        observation_layout=layout(*sizes, task.observation, task.vision),
         control_dt=task.control_dt,
         task=task,
+        others={other.name: other.fingerprint for other in others},
     )
 
 
@@ -116,6 +122,8 @@ def of_another_robot(source: str, trained: str, wanted: str) -> PolicyError:
 
 def _compare(source: str, contract: Contract, here: Contract, robot: RobotSpec) -> None:
     """Raise ``PolicyError`` for the first part in which a contract differs from the one of a robot and a task here."""
+    if contract.task.joint_slots is not None:
+        contract = _for_robot(contract, robot)
     if robot.like and contract.robot_fingerprint == robot.like:
         here = replace(here, robot=contract.robot, robot_fingerprint=robot.like)
     if contract.robot != here.robot:
@@ -142,6 +150,29 @@ def _compare(source: str, contract: Contract, here: Contract, robot: RobotSpec) 
             )
 
 
+def _for_robot(contract: Contract, robot: RobotSpec) -> Contract:
+    """Return the contract of a policy for several robots as it is for one, of which the training may know nothing.
+
+    Raises:
+        PolicyError: the robot does not fit into the slots.
+    """
+    from xreset.task.slots import check_fits
+
+    assert contract.task.joint_slots is not None
+    try:
+        check_fits(robot, contract.task.joint_slots)
+    except RobotError as error:
+        raise PolicyError(str(error)) from error
+    known = {contract.robot: contract.robot_fingerprint} | contract.others
+    return replace(
+        contract,
+        robot=robot.name,
+        robot_fingerprint=known.get(robot.name, robot.fingerprint),
+        joint_names=robot.joint_names,
+        fingertip_names=robot.fingertip_names,
+    )
+
+
 def _meaning(contract: Contract) -> dict[str, dict[str, Any]]:
     """Return the entries that define what observations and actions mean, by part of the contract and name."""
     task = asdict(contract.task)
@@ -161,7 +192,7 @@ def _meaning(contract: Contract) -> dict[str, dict[str, Any]]:
         "time between actions": {"control_dt": contract.control_dt},
         "observation layout": widths,
         "order of observations": order,
-        "action mapping": task["action"],
+        "action mapping": task["action"] | {"joint_slots": task["joint_slots"]},
         "scale of observations": observation,
         "frame of objects": {"object_frame": task["object_frame"]},
         "set of cameras": task["vision"],
@@ -290,7 +321,7 @@ class OnnxPolicy:
                 f"{path} cannot act: {shown(str(error))}. Export it again."
             ) from error
         state = (1, worlds, self._lstm_dim)
-        shapes = ((worlds, len(self.contract.joint_names)), state, state)
+        shapes = ((worlds, self.contract.num_actions), state, state)
         expected = [f"float32 {shape}" for shape in shapes]
         if found != expected:
             raise PolicyError(

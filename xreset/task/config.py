@@ -24,6 +24,7 @@ from xreset.files.checks import (
     frozen,
 )
 from xreset.files.text import shown
+from xreset.spec import FINGERS
 from xreset.task.legacy import ObservationOptions, RewardOptions
 from xreset.task.terms import Named, OneTerm, Terms, Weighted
 
@@ -424,11 +425,21 @@ class TaskConfig(Checked):
     file's axes have no effect either."""
     distance_points: PositiveInt = 256
     """Surface points per object for fingertip distances."""
+    joint_slots: tuple[PositiveInt, PositiveInt] | None = None
+    """Slots of a policy for several robots: for joints of the arm, and of each of the five fingers
+    (``xreset/task/slots.py``). None: the policy has the joints of its robot, in their order."""
 
     @property
     def control_dt(self) -> float:
         """Time between two actions [s]."""
         return self.timestep * self.substeps
+
+    def sizes(self, num_joints: int, num_tips: int) -> tuple[int, int]:
+        """Return the numbers of joints and fingertips that a policy for a robot observes: its own, or slots."""
+        if self.joint_slots is None:
+            return num_joints, num_tips
+        arm, finger = self.joint_slots
+        return arm + len(FINGERS) * finger, len(FINGERS)
 
     @property
     def policy_groups(self) -> tuple[str, str, str]:

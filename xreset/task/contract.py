@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import field
 from typing import Literal
 
 from xreset.files.checks import PositiveFloat, PositiveInt, frozen
@@ -31,3 +32,11 @@ class Contract:
     """Time between two actions [s]."""
     task: TaskConfig
     """The task of the training. ``check_contract`` compares the parts of it that must agree."""
+    others: dict[str, str] = field(default_factory=dict)
+    """Fingerprints of the other robots of the training, by name. A policy with ``task.joint_slots`` plays every robot
+    that fits into its slots."""
+
+    @property
+    def num_actions(self) -> int:
+        """Number of values of an action: joints of the robot, or slots for joints."""
+        return self.task.sizes(len(self.joint_names), len(self.fingertip_names))[0]

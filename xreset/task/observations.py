@@ -9,7 +9,7 @@ Shape letters: N worlds, J joints, E fingertips, P points, K numbers per point, 
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cached_property
+from functools import cached_property, partial
 from math import prod
 
 import torch
@@ -27,6 +27,7 @@ from xreset.geometry.rotations import (
 )
 from xreset.physics import Links, State
 from xreset.task.config import GROUPS, ObservationConfig
+from xreset.task.slots import Slots
 from xreset.task.terms import Functions
 
 
@@ -105,6 +106,22 @@ class ObservationInput:
 
 TERMS = Functions("observation")
 """Name -> observation."""
+_OF_JOINTS: set[str] = set()
+"""Terms with the same number of values for each joint."""
+_OF_TIPS: set[str] = set()
+"""Terms with the same number of values for each fingertip."""
+
+
+def _of_joints(function: Callable[..., Tensor]) -> Callable[..., Tensor]:
+    """Decorate a term with the same number of values for each joint: a policy for several robots has slots for them."""
+    _OF_JOINTS.add(function.__name__)
+    return TERMS.add(function)
+
+
+def _of_tips(function: Callable[..., Tensor]) -> Callable[..., Tensor]:
+    """Decorate a term with the same number of values for each fingertip."""
+    _OF_TIPS.add(function.__name__)
+    return TERMS.add(function)
 
 
 # The object and its goal ----------------------------------------------------------------------------------------------
@@ -168,7 +185,7 @@ def gravity_fraction(x: ObservationInput) -> Tensor:
     return x.gravity_fraction[:, None]
 
 
-@TERMS.add
+@_of_tips
 def tip_to_object(x: ObservationInput) -> Tensor:
     """[N, 3 E] vectors from the fingertips to the object's nearest points [m]. The published paper does not state the
     form of this geometry, but its number of inputs agrees."""
@@ -186,31 +203,31 @@ def palm_distance(x: ObservationInput) -> Tensor:
 # The robot ------------------------------------------------------------------------------------------------------------
 
 
-@TERMS.add
+@_of_joints
 def previous_action(x: ObservationInput) -> Tensor:
     """[N, J] in [-1, 1]."""
     return x.previous_action
 
 
-@TERMS.add
+@_of_joints
 def joint_pos(x: ObservationInput, *, noise: NonNegativeFloat) -> Tensor:
     """[N, J] joint positions between their limits, in [-1, 1]; ``noise`` [rad]."""
     return x.scaled(x.noisy(x.state.joint_pos, noise))
 
 
-@TERMS.add
+@_of_joints
 def joint_vel(x: ObservationInput, *, noise: NonNegativeFloat, scale: NonNegativeFloat) -> Tensor:
     """[N, J] joint velocities times ``scale`` [s/rad]; ``noise`` [rad/s]."""
     return scale * x.noisy(x.state.joint_vel, noise)
 
 
-@TERMS.add
+@_of_joints
 def target_pos(x: ObservationInput) -> Tensor:
     """[N, J] targets of the drives between the joints' limits, in [-1, 1]."""
     return x.scaled(x.joint_target)
 
 
-@TERMS.add
+@_of_joints
 def joint_target(x: ObservationInput) -> Tensor:
     """[N, J] distance from each joint to its drive's target [rad]. With relative hand targets no other observation of
     the draft contains it."""
@@ -247,16 +264,38 @@ def palm_angvel(x: ObservationInput) -> Tensor:
     return x.links.angvel[:, 0]
 
 
-@TERMS.add
+@_of_tips
 def tip_pos(x: ObservationInput) -> Tensor:
     """[N, 3 E] [m]"""
     return x.links.pos[:, 1:].flatten(1)
 
 
-@TERMS.add
+@_of_tips
 def tip_force(x: ObservationInput, *, scale: NonNegativeFloat) -> Tensor:
     """[N, 3 E] fingertip forces times ``scale`` [1/N], limited to [-1, 1]."""
     return (scale * x.tip_force).clamp(-1.0, 1.0).flatten(1)
+
+
+# Which robot it is, for policies of several robots --------------------------------------------------------------------
+
+
+@_of_joints
+def joint_mask(x: ObservationInput) -> Tensor:
+    """[N, J] 1 for every joint. In a policy for several robots, 0 in the slots that its robot does not fill."""
+    return torch.ones_like(x.joint_target)
+
+
+@_of_joints
+def joint_pos_limits(x: ObservationInput) -> Tensor:
+    """[N, 2 J] lower and upper limit of each joint [rad, m]. Slots of arm and fingers tell the kinds of joints."""
+    limits = torch.stack((x.joint_lower, x.joint_upper), dim=-1)
+    return (limits + torch.zeros_like(x.joint_target)[..., None]).flatten(1)
+
+
+@_of_tips
+def tip_mask(x: ObservationInput) -> Tensor:
+    """[N, E] 1 for every fingertip. In a policy for several robots, 0 for fingers that its robot does not have."""
+    return torch.ones_like(x.tip_force[..., 0])
 
 
 # Surface points -------------------------------------------------------------------------------------------------------
@@ -327,7 +366,7 @@ def reward(x: ObservationInput) -> Tensor:
     return x.reward[:, None]
 
 
-@TERMS.add
+@_of_joints
 def true_joint_vel(x: ObservationInput, *, scale: NonNegativeFloat) -> Tensor:
     """[N, J] joint velocities without noise, times ``scale`` [s/rad]."""
     return scale * x.state.joint_vel
@@ -339,12 +378,19 @@ def true_joint_vel(x: ObservationInput, *, scale: NonNegativeFloat) -> Tensor:
 class Observer:
     """The observations of a configuration."""
 
-    def __init__(self, config: ObservationConfig) -> None:
-        """Find the functions; errors as for :meth:`xreset.task.terms.Functions.bound`."""
-        self._groups = {
-            group: TERMS.bound(f"task.observation.{group}", getattr(config, group))
-            for group in GROUPS
-        }
+    def __init__(self, config: ObservationConfig, slots: Slots | None = None) -> None:
+        """Find the functions; errors as for :meth:`xreset.task.terms.Functions.bound`.
+
+        Args:
+            config: the terms.
+            slots: those of the robot, in a policy for several robots.
+        """
+        self._groups = {}
+        for group in GROUPS:
+            functions = TERMS.bound(f"task.observation.{group}", getattr(config, group))
+            if slots is not None:
+                functions = {name: _in_slots(each, slots) for name, each in functions.items()}
+            self._groups[group] = functions
 
     def functions(self, group: str) -> dict[str, Callable[[ObservationInput], Tensor]]:
         """Return a group's terms as functions, by name."""
@@ -359,12 +405,23 @@ class Observer:
         return torch.cat(list(self.terms(group, x).values()), dim=-1)
 
 
+def _in_slots(function: partial[Tensor], slots: Slots) -> Callable[[ObservationInput], Tensor]:
+    """Return a term whose values of joints and fingertips are in slots."""
+    name = function.func.__name__
+    if name in _OF_JOINTS:
+        return lambda x: slots.joints(function(x))
+    if name in _OF_TIPS:
+        return lambda x: slots.tips(function(x))
+    return function
+
+
 def layout(
     num_joints: int, num_tips: int, c: ObservationConfig, vision: VisionConfig | None = None
 ) -> dict[str, dict[str, int]]:
     """Return the number of values of every term, by group, in order. A policy fits a task only if its layout is equal.
 
-    ``perception`` has H * P * K values. With cameras the groups are ``goal``, ``proprio`` and ``view``.
+    In a policy for several robots, joints and fingertips are slots (``TaskConfig.sizes``). ``perception`` has H * P * K
+    values. With cameras the groups are ``goal``, ``proprio`` and ``view``.
 
     Raises:
         WrongValueError: as for :class:`Observer`.

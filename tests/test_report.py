@@ -11,7 +11,7 @@ import pandas as pd
 from numpy.testing import assert_allclose
 
 from tests.command import refused, succeeds
-from tests.toy_bank import SOUP, SPAM
+from tests.toy_bank import SOUP, SPAM, toy_bank
 from tests.toy_results import (
     ENGINES,
     InFolder,
@@ -34,17 +34,20 @@ from xreset.eval.report.clips import (
     worst_episodes,
 )
 from xreset.eval.report.curves import draw_training
+from xreset.eval.report.goals import goal_distances
 from xreset.eval.report.groups import singles
 from xreset.eval.report.make import collect, count_failures, headline, page
 from xreset.eval.report.read import read_trainings
 from xreset.eval.results import read_evaluation, recorded, write_result
 from xreset.eval.table import table_text
 from xreset.eval.verbs import make_report
-from xreset.files.storage import claim_folder
+from xreset.files.storage import claim_folder, file_hash
 from xreset.geometry.description import load_robot
 from xreset.geometry.shapes import pose_matrix
 from xreset.learning.clock import Lift, Passing, write_lift
+from xreset.learning.run import read_run
 from xreset.pictures.render import encode_mp4
+from xreset.resets.bank import write_bank
 
 VOID = {"meta", "br", "link", "img", "input", "hr"}
 
@@ -133,6 +136,37 @@ class CollectTest(Reported):
             one_demonstration = f"{100 * progress[sequence]:.0f}%1"
             self.assertIn(name + one_demonstration * len(ENGINES), text)
         self.assertNotIn("45 to 90°", text)
+
+    def test_progress_by_the_distance_from_the_goals_of_the_training(self):
+        """Demonstration 0 has a goal of the training, that of 1 is 3 cm away; results in another folder have it, too."""
+        bank = toy_bank(load_robot("ur7e-sharpa"))
+        traces = []
+        for trace, shift in zip(toy_rollouts().traces, (0.0, 0.03), strict=True):
+            goal = bank.goal_pos[trace.sequence] + np.array([0.0, shift, 0.0])
+            quat = bank.goal_quat_wxyz[trace.sequence]
+            traces.append(replace(trace, goal_pos=goal, goal_quat=quat))
+        rollouts = replace(toy_rollouts(), traces=tuple(traces))
+        self.write(rollouts=rollouts, inputs={"policy": "cd"})
+        self.write_results("elsewhere", rollouts, inputs={"policy": "cd"})
+        file = self.folder / "bank.npz"
+        write_bank(file, bank)
+        self.write_run("", robot=bank.robot, resets=str(file), resets_hash=file_hash(file))
+        run, other = read_trainings([self.folder, self.folder / "elsewhere"])
+        info = read_run(self.folder)
+        assert_allclose(goal_distances(other, info), [0.0, 0.0, 0.03, 0.03], atol=1e-6)
+        text = Outline(page(collect([run, other]))).text
+        self.assertIn("under 2 cm" + "66%1" * (len(ENGINES) + 1), text)
+        self.assertIn("2 to 5 cm" + "33%1" * (len(ENGINES) + 1), text)
+        self.assertNotIn("5 to 10 cm", text)
+        self.assertNotIn("under 2 cm", page(collect([other])))
+        turned = [replace(t, goal_quat=np.array([1.0, 0, 0, 0])) for t in traces]
+        self.write_results("elsewhere", replace(rollouts, traces=tuple(turned)))
+        (other,) = read_trainings([self.folder / "elsewhere"])
+        self.assertGreater(goal_distances(other, info).min(), 0.03)
+        of_other_bank = replace(info, resets_hash="ef" * 32)
+        self.assertTrue(np.isnan(goal_distances(other, of_other_bank)).all())
+        file.unlink()
+        self.assertTrue(np.isnan(goal_distances(other, info)).all())
 
     def test_the_page_says_where_nothing_is_to_be_expected(self):
         self.write(policy="ik")

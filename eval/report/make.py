@@ -21,6 +21,7 @@ from xreset.eval.plots import COLORS
 from xreset.eval.report import X, fairness, tables
 from xreset.eval.report.clips import Clip, draw_report
 from xreset.eval.report.curves import AXES, chosen_curves, draw_training, usual_axis
+from xreset.eval.report.goals import goal_distances
 from xreset.eval.report.groups import (
     COUNTED,
     Groups,
@@ -187,7 +188,8 @@ def page(report: Report) -> str:
         costly=effects.COSTLY,
         places=places,
         objects=_by(places, ["object"]),
-        turns=_by_turn(places),
+        turns=_by_class(places, "turn", TURNS),
+        goals=_by_class(places, "goal_distance", GOALS),
         demonstrations=_by(places, ["sequence_name", "object"]),
         lifted=tables.lifted(clocks, report.x),
         x=AXES[report.x][0],
@@ -196,11 +198,19 @@ def page(report: Report) -> str:
 
 
 def _places(trainings: Sequence[Training]) -> Iterator[tuple[str, Table]]:
-    """Yield the name and the episodes of each run in each engine."""
+    """Yield the name and the episodes of each run in each engine, with the column ``goal_distance``
+    (:func:`~xreset.eval.report.goals.goal_distances`). Results in another folder than their run's are of the run with
+    the same policy."""
+    runs = {}
     for training in trainings:
+        if training.run is not None and "policy" in training.first.inputs:
+            runs[training.first.inputs["policy"]] = training.run
+    for training in trainings:
+        run = runs.get(training.first.inputs.get("policy"))
+        episodes = training.episodes.assign(goal_distance=goal_distances(training, run))
         for engine in training.results:
             name = engine if len(trainings) == 1 else f"{training.label} in {engine}"
-            yield name, training.episodes[training.episodes["engine"] == engine]
+            yield name, episodes[episodes["engine"] == engine]
 
 
 def _by(places: Sequence[tuple[str, Table]], keys: list[str]) -> list[tuple[Any, list[Any]]]:
@@ -214,20 +224,40 @@ def _by(places: Sequence[tuple[str, Table]], keys: list[str]) -> list[tuple[Any,
     return list(found.items())
 
 
-TURNS = {20: "under 20°", 45: "20 to 45°", 90: "45 to 90°", 120: "90 to 120°", 181: "over 120°"}
-"""Upper limit of a class of turns [degrees] -> its name."""
+TURNS = {
+    np.radians(20): "under 20°",
+    np.radians(45): "20 to 45°",
+    np.radians(90): "45 to 90°",
+    np.radians(120): "90 to 120°",
+    np.inf: "over 120°",
+}
+"""Upper limit of a class of turns [rad] -> its name."""
+GOALS = {
+    0.02: "under 2 cm",
+    0.05: "2 to 5 cm",
+    0.1: "5 to 10 cm",
+    0.15: "10 to 15 cm",
+    np.inf: "over 15 cm",
+}
+"""Upper limit of a class of distances from the goals of the training [m] -> its name. Under 2 cm, an object at the goal
+of the training is a published success."""
 
 
-def _by_turn(places: Sequence[tuple[str, Table]]) -> list[tuple[Any, list[Any]]]:
-    """Return the means of the metrics, and the number of demonstrations, of each class of :data:`TURNS` in each place,
-    without classes that no place has; empty for files of earlier versions, which do not state the turn."""
+def _by_class(
+    places: Sequence[tuple[str, Table]], column: str, classes: dict[float, str]
+) -> list[tuple[Any, list[Any]]]:
+    """Return the means of the metrics, and the number of demonstrations, of each class of a column's values in each
+    place, without classes that no place has, and without episodes whose value is not known. ``classes``: upper limit of
+    a class -> its name, in ascending order.
+    """
     classed = []
     for name, episodes in places:
-        degrees = np.degrees(episodes["turn"].astype(float))
-        turn = pd.cut(degrees, [0, *TURNS], labels=list(TURNS.values()), right=False)
-        classed.append((name, episodes.assign(turn=turn.astype(object)).dropna(subset="turn")))
-    found = dict(_by(classed, ["turn"]))
-    return [((name,), found[(name,)]) for name in TURNS.values() if (name,) in found]
+        values = episodes[column].astype(float)
+        names = pd.cut(values, [0, *classes], labels=list(classes.values()), right=False)
+        own = episodes.assign(**{column: names.astype(object)})
+        classed.append((name, own.dropna(subset=column)))
+    found = dict(_by(classed, [column]))
+    return [((name,), found[(name,)]) for name in classes.values() if (name,) in found]
 
 
 def _sweeps(trainings: Sequence[Training]) -> Iterator[dict[str, Any]]:

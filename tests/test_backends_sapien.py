@@ -13,12 +13,12 @@ from tests.engine_checks import EngineChecks
 from xreset.backends.conformance import run
 from xreset.backends.conformance.scene import gripper, scene, shape, solid
 from xreset.backends.rigid import friction_forces, matrix_to_quat, mechanism
-from xreset.backends.sapien import SapienBackend, SapienWorld
+from xreset.backends.sapien import _PARTING_SPEED, SapienBackend, SapienWorld
 from xreset.backends.sapien_robot import _couple, self_collision_bits
 from xreset.errors import RobotError
 from xreset.geometry.description import load_robot
 from xreset.geometry.kinematics import Kinematics
-from xreset.spec import MimicSpec, SceneSpec
+from xreset.spec import GRAVITY, MimicSpec, SceneSpec
 
 
 class SapienTest(EngineChecks, TestCase):
@@ -83,6 +83,24 @@ class SapienTest(EngineChecks, TestCase):
         closing = 2 * (0.03716 * np.sin(jaw) + 0.04342 * np.cos(jaw))
         expected = 25.0 * (target[-1] - jaw) / closing
         self.assertLess(abs(np.linalg.norm(thumb) / expected - 1.0), 0.1)
+
+    def test_an_object_deep_in_the_table_rises_at_the_limit_and_comes_to_rest(self):
+        box = solid("box", 0.4, (shape("box", (0.03, 0.02, 0.025)),))
+        robot = gripper()
+        what = SceneSpec(robot=robot, objects=(box,))
+        world = SapienWorld(what, 0)
+        world.force = np.array([0.0, 0.0, -0.4 * GRAVITY])
+        state = {"joint_pos": robot.home, "joint_target": robot.home}
+        state["joint_vel"] = np.zeros(len(robot.home))
+        state["object_pos"] = np.array([0.4, 0.0, 0.005])  # 20 mm too deep
+        state["object_quat"] = np.array([1.0, 0.0, 0.0, 0.0])
+        state["object_linvel"] = state["object_angvel"] = np.zeros(3)
+        world.set_state(state)
+        world.step(1)
+        rise = world.get_state()["object_pos"][2] - 0.005
+        self.assertLess(abs(rise / (_PARTING_SPEED * what.timestep) - 1.0), 0.1)
+        world.step(239)
+        self.assertLess(abs(world.get_state()["object_pos"][2] - 0.025), 1e-5)
 
     def test_a_mimic_joint_on_another_branch_than_its_source_is_refused(self):
         def joint(parent, child):

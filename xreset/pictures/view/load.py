@@ -173,7 +173,7 @@ def _human(demos: Demos, objects: Sequence[ObjectSpec]) -> tuple[Demos, dict[str
     return demos, {"human_keypoints": keypoints, "human_touching": touching}
 
 
-def _human_of(path: Path, demos_path: Path, view: View) -> dict[str, np.ndarray]:
+def _human_of(path: str | Path, demos_path: str | Path, view: View) -> dict[str, np.ndarray]:
     """Return the fields of the hands of a view's rows, found in demonstrations by the name of the sequence and the
     frame within it."""
     demos = read_demos(demos_path)

@@ -64,7 +64,7 @@ _CONTACT_OFFSET = 0.001
 _PARTING_SPEED = 1.0
 """Speed [m/s] with which the solver parts shapes that overlap (``PxRigidBody::setMaxDepenetrationVelocity``; the lower
 one of a pair's two bodies counts). By default PhysX has no limit: it parts them within a step, and shoots away objects
-that it falsely reports centimetres deep in a fingertip."""
+that it falsely reports centimetres deep in a fingertip. With 0.5 and 2 m/s a policy does as well."""
 
 
 class SapienWorld(World):

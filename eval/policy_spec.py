@@ -222,9 +222,9 @@ def load_policy(
     spec = load_robot(robot or (run.robot if run else contract.robot))
     if not is_graph:
         check_robot_of(str(found.path), contract, spec)
-    elif contract.joint_names != spec.joint_names and contract.robot != spec.name:
-        raise of_another_robot(str(found.path), contract.robot, spec.name)
     elif contract.joint_names != spec.joint_names:
+        if contract.robot != spec.name:
+            raise of_another_robot(str(found.path), contract.robot, spec.name)
         raise PolicyError(
             f"{found.path} has the joints {', '.join(contract.joint_names)}, but the robot {spec.name!r} has "
             f"{', '.join(spec.joint_names)}."

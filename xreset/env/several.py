@@ -39,13 +39,15 @@ class SeveralEnvs:
         self.max_episode_length = first.max_episode_length
         self._worlds = [env.num_envs for env in self.envs]
         self.num_envs = sum(self._worlds)
+        expected = first.get_observations()
         for env in self.envs[1:]:
             for group, value in env.get_observations().items():
-                expected = first.get_observations()[group].shape[1:]
-                if value.shape[1:] != expected:
+                shape = tuple(value.shape[1:])
+                wanted = tuple(expected[group].shape[1:])
+                if shape != wanted:
                     raise XResetError(
-                        f"The observations {group!r} have the shape {tuple(expected)} in {first!r}, but "
-                        f"{tuple(value.shape[1:])} in {env!r}. Omit the terms that differ, or train each robot alone."
+                        f"The observations {group!r} have the shape {wanted} in {first!r}, but {shape} in {env!r}. "
+                        "Omit the terms that differ, or train each robot alone."
                     )
         # One tensor, parts of which the environments write: a training averages it between processes, and saves it.
         rates = [env.resets.success_rate for env in self.envs]

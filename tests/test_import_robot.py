@@ -380,6 +380,7 @@ class Toy(Robots):
             ("size 1e-300 m, expected 1e-06 m or more", '"0.018 0.007 0.007"', '"1e-300 1 1"'),
             ("5010 shapes. Use 5000 at most", "</body></worldbody>", _COPIES),
             ("Give the file that includes it", MJCF, "<mujocoinclude/>"),
+            ("part of another file.* give that file", "<geom", '<geom class="of the scene"'),
             ("has no robot", MJCF, "<mujoco><worldbody><body name='a'/></worldbody></mujoco>"),
         ):
             with refuses(self, words, RobotError):
@@ -788,7 +789,7 @@ class Published(Robots):
         )
         self.assertRegex(
             "\n".join(made.guessed),
-            "WRJ2, WRJ1 move the whole hand: they are the last joints of the arm",
+            "last joints of the arm, because they move the whole hand: WRJ2, WRJ1; the hand begins",
         )
         # Its fingers are side by side: with the usual spread around home they touch in every second episode.
         usual = replace(spec, home_std=(0.075, 0.1))

@@ -35,12 +35,31 @@ class Judge(InFolder):
         self.assertEqual((brick_row.tried, brick_row.hold, brick_row.lift), (3, 3, 3))
         # its arm cannot turn that way
         self.assertEqual((sum_row.arm_fails, sum_row.turn), (3, 0))
-        self.assertEqual(found.kept, [])
+        self.assertEqual(found.prospects, {"brick": 0.0})
         # the toy bank's targets are the joints' positions, and its hand is no jaw
         reached = [(row.object_name, row.reached, row.lost) for row in found.reach]
         self.assertEqual(reached, [(name, 0, {"no grasp": 3}) for name in ("brick", "all")])
         rise = np.diff(found.shots["brick"][:, -5])  # of the object's z
         self.assertGreater(rise[1], 0.08)
+
+    def test_prospects_are_states_that_turn_times_demonstrations_in_reach(self):
+        def row(engine, name, turn):
+            return judging.Judged(
+                engine=engine, object_name=name, tried=8, hold=8, lift=8, turn=turn, arm_fails=0
+            )
+
+        def reach(name, reached):
+            return judging.Reached(object_name=name, demonstrations=4, reached=reached, lost={})
+
+        found = judging.Judgement(
+            robot="hand",
+            rows=(row("a", "can", 4), row("a", "box", 8), row("b", "can", 0), row("b", "box", 0)),
+            without=("pen",),
+            reach=(reach("can", 4), reach("box", 3), reach("pen", 4), reach("all", 11)),
+            shots={},
+        )
+        expected = [("box", 0.75), ("can", 0.5), ("pen", 0.0)]
+        self.assertEqual([*found.prospects.items()], expected)
 
     def test_the_arm_raises_and_turns_the_palm(self):
         kinematics = Kinematics(load_robot("ur7e-sharpa"))
@@ -80,4 +99,5 @@ class Judge(InFolder):
             main(["robots", "judge", f"{self.folder}/bank.npz", *words.split()])
         self.assertRegex(output.getvalue(), r"brick +│ +3 +│ 0, 0, 0")
         self.assertIn("in 3 of 3 states", output.getvalue())
+        self.assertIn("demonstrations in reach): brick 0%", output.getvalue())
         self.assertEqual(Image.open(self.folder / "judge.png").size[0], 4 * judging._TILE[0])

@@ -113,8 +113,10 @@ def _show_judged(found: Judgement, options: Mapping[str, Any]) -> None:
         console.print(
             f"no accepted state has these objects in the air between thumb and finger: {absent}"
         )
+    order = ", ".join(f"{name} {share:.0%}" for name, share in found.prospects.items())
     console.print(
-        f"at least half of the states hold, lift and turn these objects in every engine: {', '.join(found.kept) or '-'}"
+        f"what training is likely to learn, best first (states that turn in {names[0]} x demonstrations in reach): "
+        f"{order}"
     )
     if options["picture"]:
         console.print(f"wrote {options['picture']}")

@@ -118,7 +118,7 @@ class Hand:
         ]
         if wrist:
             notes.append(
-                f"{', '.join(wrist)} move the whole hand: they are the last joints of the arm, and the hand begins "
+                f"last joints of the arm, because they move the whole hand: {', '.join(wrist)}; the hand begins "
                 f"with {self.root!r}. In the hand's file, make a joint fixed to keep it still, or if it moves no "
                 "finger but another part, such as a camera"
             )

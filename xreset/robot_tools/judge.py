@@ -114,10 +114,16 @@ class Judgement:
     and after each phase in the first engine."""
 
     @property
-    def kept(self) -> list[str]:
-        """Objects of which at least half of the states pass all phases in every engine."""
-        lost = {row.object_name for row in self.rows if row.turn < row.tried / 2}
-        return [name for name in self.shots if name not in lost]
+    def prospects(self) -> dict[str, float]:
+        """Object -> share of its states that hold, lift and turn it in the first engine, times the share of its
+        demonstrations in reach; the largest first. What trained policies reach has this order, roughly."""
+        turned = {row.object_name: row.turn / row.tried for row in reversed(self.rows)}
+        shares = {}
+        for row in self.reach[:-1]:  # the last one is their sum
+            shares[row.object_name] = (
+                turned.get(row.object_name, 0.0) * row.reached / row.demonstrations
+            )
+        return dict(sorted(shares.items(), key=lambda item: -item[1]))
 
 
 def try_grasps(

@@ -141,7 +141,10 @@ def _compiled(path: Path, unit: str = "") -> mujoco.MjModel:
         done = subprocess.run(command, cwd=folder, capture_output=True, text=True, errors="replace")
         if done.returncode == 1 and "alloc" not in done.stdout:
             _refuse_pointers([path.parent / name for name in re.findall("'([^']+)'", done.stdout)])
-            raise RobotError(f"{path} is not valid MJCF: {done.stdout.strip()}")
+            raise RobotError(
+                f"{path} is not valid MJCF: {done.stdout.strip()}. If it is a part of another file, such as a scene "
+                "that includes it, give that file."
+            )
         if done.returncode:
             raise RobotError(
                 f"{path} takes more than {most >> 20} MB of memory, or half a minute, when MuJoCo reads it. Leave out "

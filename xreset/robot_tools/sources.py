@@ -130,7 +130,7 @@ def bare(arm: RobotTree, flange: str, notes: list[str]) -> RobotTree:
     removed = set(arm.below(flange)) - {flange}
     if removed:
         notes.append(
-            f"left out, because it hangs on the flange where the hand goes: {', '.join(sorted(removed))}"
+            f"left out, because it hangs on the flange where the hand goes: {listed(sorted(removed))}"
         )
     stiff = []
     for link, joint in arm.moved_by.items():

@@ -126,7 +126,7 @@ class UsageTest(TestCase):
                 r"episode_seconds is -1.0, expected a number from 0.0167, which is one control step",
                 "eval zero --robot openarm --demos none.npz --episode-seconds -1",
             ),
-            (r"--minutes is not a number", "train --out x --minutes nan"),
+            (r"--minutes is nan, expected a number above 0", "train --out x --minutes nan"),
             (r"Unknown device 'quantum'. Expected cpu, cuda or", "train --out x --device quantum"),
             (r"(File name too long|there is no)", "demos select " + "x" * 300),
             (r"there is nothing to report\. Give run folders", "report --robot openarm"),

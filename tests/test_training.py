@@ -13,6 +13,7 @@ import threading
 import time
 from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
 from dataclasses import asdict, replace
+from itertools import count
 from pathlib import Path
 from unittest.mock import Mock, patch
 
@@ -200,7 +201,7 @@ class TrainingTest(WithBank):
         after = newest(out)
         self.assertEqual((after.iteration, after.env_steps), (3, 3 * 8 * 4))
         self.assertGreater(after.elapsed, two.elapsed)
-        self.assertEqual(read_run(out).config.iterations, 3)
+        self.assertEqual(read_run(out).total, 3)
         steps = {int(s["step"]) for s in after.optimizer_state_dict["state"].values()}
         self.assertEqual(
             steps, {3 * 2 * 2}, "iterations x epochs x minibatches: the optimiser went on"
@@ -253,14 +254,23 @@ class TrainingTest(WithBank):
         stopped = newest(out).iteration
         self.assertGreater(stopped, 0)
         self.assertEqual(latest_checkpoint(out).name, f"{stopped:06d}.pt")
-        said = self.resume(out, minutes=(newest(out).elapsed * 1.1 + 0.1) / 60)
-        self.assertIn(f"To continue: xreset train --out {out} --resume", said)
+        self.resume(out, minutes=(newest(out).elapsed * 1.1 + 0.1) / 60)
         done = newest(out).iteration
         self.assertGreater(done, stopped)
+        self.assertIn(
+            "is trained", self.resume(out), "it is continued with the minutes given before"
+        )
         said = self.resume(out, minutes=newest(out).elapsed / 60)
         self.assertIn("is trained", said, "minutes are those of the whole training")
         self.resume(out, iterations=done + 1)
         self.assertEqual(newest(out).iteration, done + 1)
+
+    def test_minutes_end_a_training_that_has_done_the_iterations_of_its_recipe(self):
+        with patch("xreset.learning.runner.time", Mock(perf_counter=count().__next__)):
+            out = self.train("minutes", config=ONE, minutes=0.1)  # an iteration takes 2 s
+            self.assertEqual(newest(out).iteration, 3)
+            self.assertIn("is trained", self.resume(out))
+            self.assertIn("iteration 4/4, 0.1/1 min", self.resume(out, iterations=4, minutes=1.0))
 
     def test_the_same_call_goes_on_and_another_one_is_refused(self):
         out = self.folder / "job-again"

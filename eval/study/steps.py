@@ -10,7 +10,6 @@ Studies with the same OUT share its content: a run of the same name and configur
 
 from __future__ import annotations
 
-import math
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -215,8 +214,8 @@ def train_todo(run: Run) -> Todo:
     """Return what is left to do of a training: start it, or continue from its newest checkpoint."""
     spec = run.spec
     assert run.config is not None
-    iterations = run.config.iterations
-    left = training_left(run.folder, iterations, spec.minutes or math.inf)
+    iterations = run.config.iterations if spec.steps or not spec.minutes else None
+    left = training_left(run.folder, iterations, spec.minutes)
     if not left:
         return "", []
     length = {"out": run.folder, "iterations": iterations, "minutes": spec.minutes}

@@ -12,11 +12,13 @@ from xreset.cli._common import quick_engines
 from xreset.cli._terminal import console
 from xreset.cli._verbs import verb
 from xreset.errors import RunError
-from xreset.files.checks import PositiveInt, Seed, obeys_rules
+from xreset.files.checks import PositiveFloat, PositiveInt, Seed, obeys_rules
 from xreset.files.records import stated_inputs
 from xreset.files.storage import file_hash
 from xreset.physics.plugins import Device
 
+_MINUTES = 25.0
+"""Length of the training where nothing else is said."""
 _RETARGET = 0.025
 _RESETS = 0.055
 _EPISODE = 1.0
@@ -35,7 +37,7 @@ def run(
     recipe: str = "default",
     device: Device | None = None,
     num_envs: PositiveInt = 4096,
-    minutes: float = 25.0,
+    minutes: PositiveFloat | None = None,
     iterations: PositiveInt | None = None,
     seed: Seed = 0,
     episodes: PositiveInt = 5,
@@ -55,8 +57,8 @@ def run(
         recipe: recipe of the training, or another run's folder.
         device: where to train: cpu or cuda; default: cuda where there is a GPU.
         num_envs: worlds of the training.
-        minutes: time of the whole training, without compiling kernels.
-        iterations: most iterations of the training; default: the recipe's.
+        minutes: time of the whole training, without compiling kernels; default: 25, unless iterations are given.
+        iterations: iterations of the whole training.
         seed: seed of the training and of the evaluations' starts.
         episodes: episodes of each demonstration in each engine.
 
@@ -75,6 +77,8 @@ def run(
     spec = load_robot(robot)
     named = [engine] if isinstance(engine, str) else engine
     engines = [each.name for each in quick_engines(named, "cpu")]
+    if minutes is None and iterations is None:
+        minutes = _MINUTES
     _show_times(len(archive.sequence_name), archive.num_frames, minutes, episodes, engines)
     motion = out / "motion.npz"
     bank = out / "resets.npz"
@@ -111,7 +115,7 @@ def run(
 
 
 def _show_times(
-    sequences: int, frames: int, minutes: float, episodes: int, engines: list[str]
+    sequences: int, frames: int, minutes: float | None, episodes: int, engines: list[str]
 ) -> None:
     """Print about how long each step takes on this machine."""
     cores = os.cpu_count() or 1

@@ -128,9 +128,9 @@ class ScheduleConfig(Checked):
     """Settings that change during a run.
 
     A schedule is a list of points: a share of the run and the setting's value there, such as ``0 0.9 1 0.25``. Values
-    between two points lie on a straight line. The share of the run is that of its iterations, or that of its
-    minutes if these are limited and more of them have passed. A run that is resumed continues where it stopped, not at
-    share 0.
+    between two points lie on a straight line. The share of the run is that of its iterations or that of its minutes,
+    whichever is larger; a limit that the run does not have counts as 0. A run that is resumed continues where it
+    stopped, not at share 0.
     """
 
     teacher: ShareSchedule = ()
@@ -174,6 +174,7 @@ class TrainConfig(Checked):
     ppo: PpoConfig = PPO
     schedule: ScheduleConfig = ScheduleConfig()
     iterations: PositiveInt = 2600
-    """Number of iterations; 2,600 with 4,096 worlds are 170 M steps, or 25 minutes of one H100."""
+    """Number of iterations of a training that is given neither iterations nor minutes; 2,600 with 4,096 worlds are 170
+    M steps, or 25 minutes of one H100."""
     save_interval: PositiveInt = 50
     """Iterations between checkpoints."""

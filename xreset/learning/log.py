@@ -29,9 +29,10 @@ class TrainingLog:
         folder: Path,
         num_envs: int,
         device: str,
-        total: int,
+        total: int | None,
         wandb: str | None = None,
         *,
+        minutes: float | None = None,
         done: int = 0,
     ) -> None:
         """Start the log of a run.
@@ -40,7 +41,8 @@ class TrainingLog:
             folder: run folder.
             num_envs: number of worlds.
             device: where rewards are.
-            total: number of iterations in all.
+            total: number of iterations in all; None: any number.
+            minutes: time of the training in all; None: any time.
             done: number of iterations that have been done. What was logged after them is forgotten.
             wandb: project of Weights & Biases to which the curves and ``run.json`` are sent; None: nothing is sent.
 
@@ -70,7 +72,10 @@ class TrainingLog:
         self._recent: deque[list[float]] = deque(maxlen=RECENT)
         self._names: tuple[str, ...] = ()
         self._steps: list[Tensor] = []
-        self._total = total
+        self._of_total = "" if total is None else f"/{total}"
+        self._of_minutes = "" if minutes is None else f"/{minutes:g}"
+        self._line = ""
+        """What the newest iteration would print; empty: it is printed."""
         self._last_line = 0.0
 
     def add(self, reward: Tensor, done: Tensor, log: dict[str, Tensor]) -> None:
@@ -116,23 +121,30 @@ class TrainingLog:
         self.lift = before.after(own, iteration=iteration, env_steps=env_steps, seconds=elapsed)
         if self.lift.passed != before.passed:
             self.write_lift()
-        if time.monotonic() - self._last_line > _LINE_SECONDS or iteration == self._total:
-            self._last_line = time.monotonic()
-            print(
-                f"iteration {iteration}/{self._total}  return {returns / max(episodes, 1):7.3f}  "
-                f"grasped {means['task/grasped']:5.1%}  success {means['task/success']:5.1%}, "
-                f"from home {from_home:5.1%}  {scalars['speed/env_steps_per_second']:,.0f} steps/s",
-                flush=True,
-            )
+        self._line = (
+            f"iteration {iteration}{self._of_total}, {elapsed / 60:.1f}{self._of_minutes} min  "
+            f"return {returns / max(episodes, 1):7.3f}  "
+            f"grasped {means['task/grasped']:5.1%}  success {means['task/success']:5.1%}, "
+            f"from home {from_home:5.1%}  {scalars['speed/env_steps_per_second']:,.0f} steps/s"
+        )
+        if time.monotonic() - self._last_line > _LINE_SECONDS:
+            self._print_line()
         self._finished.zero_()
         self._steps.clear()
+
+    def _print_line(self) -> None:
+        if self._line:
+            print(self._line, flush=True)
+        self._line = ""
+        self._last_line = time.monotonic()
 
     def write_lift(self) -> None:
         """Write the lift clock."""
         write_lift(self._folder, self.lift)
 
     def close(self) -> None:
-        """End the files."""
+        """Print the last line, and end the files."""
+        self._print_line()
         self._curves.close()
         if self._online is not None:
             self._online.finish()

@@ -10,7 +10,6 @@ RUN/eval/, RUN/report/       made by ``xreset eval`` and ``xreset report``
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Iterator
 from dataclasses import asdict, replace
@@ -18,7 +17,14 @@ from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
 from xreset.errors import RunError
-from xreset.files.checks import Checked, NonNegativeInt, PositiveInt, from_dict, frozen
+from xreset.files.checks import (
+    Checked,
+    NonNegativeInt,
+    PositiveFloat,
+    PositiveInt,
+    from_dict,
+    frozen,
+)
 from xreset.files.storage import read_json, write_json
 from xreset.files.text import shown
 from xreset.learning.clock import Lift, read_lift
@@ -78,8 +84,18 @@ class RunInfo(Checked):
     """Name of the policy that a distillation learns from; it is copied to ``teacher.onnx``. None: the rewards teach."""
     others: tuple[RobotData, ...] = ()
     """The other robots of a policy for several."""
+    iterations: PositiveInt | None = None
+    """Iterations of the whole training that the user gave."""
+    minutes: PositiveFloat | None = None
+    """Minutes of the whole training, without compiling, that the user gave."""
     lift: Lift = Lift()
     """When success from home passed its marks, and how far the training has come."""
+
+    @property
+    def total(self) -> int | None:
+        """Number of iterations that ends the training: the given one; those of the configuration if no length was
+        given; None if only minutes were given."""
+        return self.iterations if self.iterations or self.minutes else self.config.iterations
 
 
 def write_run(folder: Path, info: RunInfo) -> None:
@@ -161,20 +177,24 @@ def played_checkpoint(folder: Path) -> Path:
     return next((each for each in checkpoints(folder) if each.name == chosen), newest)
 
 
-def training_left(folder: Path, iterations: int, minutes: float = math.inf) -> str:
+def training_left(folder: Path, iterations: int | None, minutes: float | None = None) -> str:
     """Return what is left to do of a training, in words; empty if it is done.
 
     Args:
         folder: run folder, which need not exist.
-        iterations: iterations in all.
-        minutes: time of the training in all, without compiling.
+        iterations: iterations in all; None: any number.
+        minutes: time of the training in all, without compiling; None: any time.
     """
     done = read_lift(folder)
     found = checkpoints(folder)
     iteration = int(found[-1].stem) if found else done.iteration
-    if iteration >= iterations or done.minutes >= ENOUGH * minutes:
-        return ""
-    if not iteration:
-        return "not begun"
-    left = f"{iteration} of {iterations} iterations"
-    return left if minutes == math.inf else f"{left}, {done.minutes:.1f} of {minutes:g} minutes"
+    left = []
+    if iterations is not None:
+        left.append(f"{iteration} of {iterations} iterations")
+        if iteration >= iterations:
+            return ""
+    if minutes is not None:
+        left.append(f"{done.minutes:.1f} of {minutes:g} minutes")
+        if done.minutes >= ENOUGH * minutes:
+            return ""
+    return ", ".join(left) if iteration else "not begun"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 import signal
 import stat
@@ -99,18 +98,19 @@ class TrainingRunner:
         self._fault_totals = deque([[0, 0]], maxlen=FAULT_WINDOW)
         self._resume_command = resume_command(folder, config.task.reward.own)
 
-    def learn(self, total: int, *, seconds: float = math.inf) -> int | None:
-        """Train until a number of iterations is done in all, and write a checkpoint.
+    def learn(self, total: int | None, *, minutes: float | None = None) -> int | None:
+        """Train until a number of iterations is done in all or a time is over, and write a checkpoint.
 
         A signal (Ctrl-C, SIGTERM or SIGHUP) ends the training earlier, after an iteration. The first episodes start at
         random times, so that the worlds do not end them together.
 
         Args:
-            total: iterations in all, those of a resumed run included.
-            seconds: most time of training in all, those of a resumed run included; the present iteration is completed.
+            total: iterations in all, those of a resumed run included; None: any number.
+            minutes: time of training in all, that of a resumed run included; the present iteration is completed. None:
+                any time.
 
         Returns:
-            The signal that ended the training before its last iteration; None: it ended by itself.
+            The signal that ended the training before its end; None: it ended by itself.
         """
         env = self.env
         env.episode_length_buf = torch.randint_like(
@@ -123,7 +123,13 @@ class TrainingRunner:
         log = None
         if self.processes.is_main:
             log = TrainingLog(
-                self.folder, env.num_envs, self.device, total, self.wandb, done=self.iteration
+                self.folder,
+                env.num_envs,
+                self.device,
+                total,
+                self.wandb,
+                minutes=minutes,
+                done=self.iteration,
             )
         saved_at = self.iteration
         minibatch = min(self.config.ppo.minibatch_size, self.config.ppo.horizon * env.num_envs)
@@ -132,10 +138,8 @@ class TrainingRunner:
             one_thread() if is_small else nullcontext(),
             _stop_on_interrupt(say=self.processes.is_main) as requests,
         ):
-            while self.iteration < total:
-                if self._agreed(bool(requests) or self.elapsed >= seconds):
-                    break
-                self._follow_schedule(max(self.iteration / total, self.elapsed / seconds))
+            while not self._agreed(bool(requests) or self._progress(total, minutes) >= 1):
+                self._follow_schedule(self._progress(total, minutes))
                 obs = self._iterate(obs, log)
                 if self.iteration % self.config.save_interval == 0:
                     self.save_checkpoint()
@@ -144,16 +148,21 @@ class TrainingRunner:
                         log.write_lift()
         if self.iteration != saved_at or not self.iteration:
             self.save_checkpoint()
+        is_done = self._progress(total, minutes) >= 1
         if log is not None:
             log.close()
-            if self.iteration < total:
+            if not is_done:
                 print(
                     "stopped after the current iteration; a checkpoint is written. To continue: "
                     + self._resume_command
                 )
-        if not requests or self.iteration >= total:
-            return None
-        return requests[0].number
+        return requests[0].number if requests and not is_done else None
+
+    def _progress(self, total: int | None, minutes: float | None) -> float:
+        """Return the share of the training that is done, by iterations or by minutes, whichever is larger."""
+        by_iterations = 0.0 if total is None else self.iteration / total
+        by_minutes = 0.0 if minutes is None else self.elapsed / (60 * minutes)
+        return max(by_iterations, by_minutes)
 
     def _agreed(self, stop: bool) -> bool:
         """Whether any process is to stop: then all do, after the same iteration."""

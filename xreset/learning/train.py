@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -176,7 +175,7 @@ def resume(
     out: str | Path,
     *,
     iterations: int | None = None,
-    minutes: float = math.inf,
+    minutes: float | None = None,
     own: Mapping[str, Mapping[str, Any]] | None = None,
     wandb: str | None = None,
 ) -> Path:
@@ -184,8 +183,8 @@ def resume(
 
     Args:
         out: the run's folder.
-        iterations: number of iterations in all; default: as the run was started.
-        minutes: most time of the whole training, as for :func:`train`.
+        iterations: number of iterations in all.
+        minutes: time of the whole training. With neither, the training ends as it was started to end.
         own: the user's own reward terms with which the run was started: name -> parameters. They name code to import,
             which a file must not decide.
         wandb: as for :func:`train`.
@@ -196,7 +195,6 @@ def resume(
             does not fit, another process is training here, or there is too little memory.
         PolicyError: the robot has changed, or the policy observed something else in an earlier version of xreset.
     """
-    check_minutes(minutes)
     out = Path(out)
     info = read_run(out)
     expected = info.config.task.reward.own
@@ -206,9 +204,9 @@ def resume(
             f"{out} was trained with {len(expected)} reward terms of your own, but {len(own or {})} were named. "
             f"A run folder must not decide which code is imported. If you trust this code, {fix}."
         )
-    if iterations is not None:
-        info = replace(info, config=replace(info.config, iterations=iterations))
-    if checkpoints(out) and not training_left(out, info.config.iterations, minutes):
+    if iterations is not None or minutes is not None:
+        info = replace(info, iterations=iterations, minutes=minutes)
+    if checkpoints(out) and not training_left(out, info.total, info.minutes):
         print(
             f"{out} is trained. To prolong the training, give more --iterations (or --minutes).",
             flush=True,
@@ -229,7 +227,7 @@ def resume(
         check_contract(str(out), info.contract, loaded.robot, info.config.task)
         inputs.append(loaded)
     with _claimed(out), cleanly(out, info):
-        run_training(out, info, inputs, minutes=minutes, resumed=True, wandb=wandb)
+        run_training(out, info, inputs, resumed=True, wandb=wandb)
     return out
 
 
@@ -275,12 +273,6 @@ def bank_or_goals(
             "folder, add --resume (resume=True)."
         )
     return given
-
-
-def check_minutes(minutes: float) -> None:
-    """Refuse, with ``RunError``, a length that is no time."""
-    if not minutes > 0:
-        raise RunError(f"minutes is {minutes}, expected more than 0.")
 
 
 def check_config(config: TrainConfig, inputs: Inputs, *, has_teacher: bool) -> None:
@@ -424,7 +416,6 @@ def start(
     others: Sequence[Inputs],
     teacher: OnnxPolicy | None,
     *,
-    minutes: float,
     wandb: str | None,
 ) -> None:
     """Make a run folder and train in it.
@@ -441,7 +432,7 @@ def start(
         info = replace(info, resets=str(inputs.path), resets_hash=str(inputs.hash))
         with cleanly(out, info):
             all_inputs = (inputs, *others)
-            run_training(out, info, all_inputs, minutes=minutes, resumed=False, wandb=wandb)
+            run_training(out, info, all_inputs, resumed=False, wandb=wandb)
 
 
 def run_training(
@@ -449,7 +440,6 @@ def run_training(
     info: RunInfo,
     inputs: Sequence[Inputs],
     *,
-    minutes: float,
     resumed: bool,
     wandb: str | None,
 ) -> None:
@@ -490,7 +480,7 @@ def run_training(
             runner.load_networks(Path(info.weights))
         if processes.is_main:
             _write_start(out, info, runner.iteration, is_new=newest is None, resumed=resumed)
-        stopped_by = runner.learn(info.config.iterations, seconds=60 * minutes)
+        stopped_by = runner.learn(info.total, minutes=info.minutes)
     if processes.is_main:
         policy = out / "policy.onnx"
         export_checkpoint(latest_checkpoint(out), policy)
@@ -514,8 +504,11 @@ def _write_start(out: Path, info: RunInfo, iteration: int, *, is_new: bool, resu
     if is_new and (out / "run.json").is_file():
         for events in out.glob("events.out.tfevents.*"):
             events.unlink()
-    stated = read_run(out, as_stated=True) if resumed else info
-    write_run(out, replace(stated, config=info.config))
+    stated = info
+    if resumed:
+        as_stated = read_run(out, as_stated=True)
+        stated = replace(as_stated, iterations=info.iterations, minutes=info.minutes)
+    write_run(out, stated)
     if resumed:
         done = f"continuing after iteration {iteration}"
         if is_new:

@@ -5,7 +5,6 @@ It imports most of what it needs when it is called, because the help of a comman
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
@@ -14,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from xreset.cameras.config import CameraConfig
 from xreset.errors import RunError, XResetError
-from xreset.files.checks import Option, Output, PositiveInt, Seed, obeys_rules
+from xreset.files.checks import Option, Output, PositiveFloat, PositiveInt, Seed, obeys_rules
 from xreset.files.storage import file_hash
 from xreset.learning.config import TrainConfig
 from xreset.learning.recipes import default_config, for_robots, from_home, starting_config
@@ -45,7 +44,7 @@ def train(
     device: Device | None = None,
     num_envs: PositiveInt | None = None,
     iterations: PositiveInt | None = None,
-    minutes: float = math.inf,
+    minutes: PositiveFloat | None = None,
     seed: Seed | None = None,
     resume: bool = False,
     recipe: str | Path | None = None,
@@ -70,8 +69,9 @@ def train(
         engine: physics engine to train on; default: mujoco-warp.
         device: where to train: cpu or cuda; default: cuda where there is a GPU and the engine can use it.
         num_envs: worlds to simulate (per GPU); default: 4096, for a student 1024.
-        iterations: total number of iterations; default: the configuration's.
-        minutes: longest time of the whole training, without compiling kernels: a run that continues has the rest of it.
+        iterations: iterations of the whole training; default: the configuration's, unless minutes are given.
+        minutes: time of the whole training, without compiling kernels: a run that continues has the rest of it. With
+            iterations and minutes, the training ends with what is reached first.
         seed: seed of every random number; default: 0.
         resume: continue the run in the folder as it was started: its other options need not be given. Name reward terms
             of your own again.
@@ -119,12 +119,9 @@ def train(
         own = config.task.reward.own if config else None
         return training.resume(out, own=own, **length)
     config = _configuration(config, recipe, weights, teacher, cameras, goals)
-    if iterations is not None:
-        config = replace(config, iterations=iterations)
     present = read_run(out) if checkpoints(out) else None
     engine = engine or "mujoco-warp"
     device = _device(device, engine, present)
-    training.check_minutes(minutes)
     data = training.bank_or_goals(first, goals)
     load = partial(load_inputs, robot=robot, meshes=meshes, accept=("bank", "goals"))
     inputs = load(data)
@@ -160,16 +157,16 @@ def train(
         weights_hash=file_hash(start) if start else None,
         teacher=str(teacher) if teacher else None,
         others=tuple(map(_robot_data, loaded[1:])),
+        iterations=iterations,
+        minutes=minutes,
     )
     if present is None:
-        training.start(
-            out, info, data, load, loaded[1:], teacher_policy, minutes=minutes, wandb=wandb
-        )
+        training.start(out, info, data, load, loaded[1:], teacher_policy, wandb=wandb)
         return out
     if not isinstance(data, str | Path):
         info = replace(info, resets_hash=training.hash_of(data))
     training.refuse_another_training(out, present, info, teacher_policy)
-    length["iterations"] = config.iterations
+    length["iterations"] = info.total
     return training.resume(out, own=config.task.reward.own, **length)
 
 

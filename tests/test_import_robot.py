@@ -590,6 +590,15 @@ class Toy(Robots):
         self.assertRaisesRegex(RobotError, words, self.imported, HAND, two)
         self.assertRaisesRegex(RobotError, "no link 'wrist'", self.imported, HAND, flange="wrist")
 
+    def test_the_arm_of_a_robot_carries_another_hand(self):
+        again = load_robot(self.imported(HAND, arm=self.sources / "mine"))
+        self.assertEqual(again.joint_names, self.spec.joint_names)
+        joints = tensor(self.spec.home)[None]
+        poses = [Kinematics(spec).link_poses(joints, [spec.palm]) for spec in (self.spec, again)]
+        assert_allclose(poses[1], poses[0], atol=1e-5)
+        with self.assertRaisesRegex(RobotError, "absent.urdf. is not a file"):
+            self.imported(HAND, arm=self.sources / "absent.urdf")
+
     def test_a_hand_whose_root_is_inside_it_is_moved_in_front_of_the_flange(self):
         """Its palm is along x, from 0 to 80 mm."""
         made = make_robot(self.arm, self.hand, self.folder / "mine", rpy=(0, np.pi / 2, 0))

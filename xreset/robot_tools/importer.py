@@ -19,12 +19,13 @@ from xreset.files.checks import frozen
 from xreset.files.storage import atomic_folder
 from xreset.files.text import listed
 from xreset.geometry.collision import SelfCollision
-from xreset.geometry.description import DESCRIPTION
+from xreset.geometry.description import DESCRIPTION, load_robot
 from xreset.geometry.dynamics import drive_inertia
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.shapes import roll_pitch_yaw, surface_of
 from xreset.geometry.urdf import Joint, RobotTree
 from xreset.geometry.urdf_writer import axes, pose
+from xreset.physics.plugins import robot_names
 from xreset.robot_tools.check import MOST_TOUCHING, Finding, check, touching_itself
 from xreset.robot_tools.draft import description_text, draft_spec
 from xreset.robot_tools.fingers import Hand
@@ -180,8 +181,13 @@ class _Arm:
 
 
 def _read_arm(path: Path, flange: str | None, notes: list[str]) -> _Arm:
-    """Read an arm, and find its flange where that is None."""
-    tree = read_source(path, notes)
+    """Read an arm, or that of a robot with a robot.toml, and find its flange where that is None."""
+    if path.is_dir() or str(path) in robot_names():
+        robot = load_robot(path)
+        tree = read_source(robot.urdf, notes)
+        flange = flange or tree.above[robot.hand_root].parent
+    else:
+        tree = read_source(path, notes)
     if flange is None:
         flange = last_link(tree)
         notes.append(f"the hand is carried by the arm's link {flange!r} (--flange says another)")

@@ -74,7 +74,8 @@ def import_robot(
     only you can decide.
 
     Args:
-        arm: URDF or MJCF of the arm; leave it out if the hand's file holds the arm as well.
+        arm: URDF or MJCF of the arm, or name or folder of a robot whose arm is taken; leave it out if the hand's file
+            holds the arm as well.
         hand: URDF or MJCF of the hand. Joints that move all fingers become joints of the arm.
         out: folder to make.
         name: name of the robot; default: the folder's.

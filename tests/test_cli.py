@@ -127,6 +127,14 @@ class UsageTest(TestCase):
                 "eval zero --robot openarm --demos none.npz --episode-seconds -1",
             ),
             (r"--minutes is nan, expected a number above 0", "train --out x --minutes nan"),
+            (
+                r"--objects is given more than once. Give all of its values together: --objects A B",
+                "demos synth --out x.npz --objects soup --objects banana",
+            ),
+            (
+                r"--config.model.critic-mlp is given more than once",
+                "train --out x --config.model.critic-mlp 8 --config.model.critic_mlp=4",
+            ),
             (r"Unknown device 'quantum'. Expected cpu, cuda or", "train --out x --device quantum"),
             (r"(File name too long|there is no)", "demos select " + "x" * 300),
             (r"there is nothing to report\. Give run folders", "report --robot openarm"),
@@ -197,7 +205,7 @@ class UsageTest(TestCase):
                 self.assertEqual((vision.width, vision.cameras), (32, (WRIST,)))
             run("distill", *student.split()[2:])
         given = (calls[-1]["teacher"], calls[-1]["bank"])
-        self.assertEqual(given, (Path("many-objects"), Path("x.npz")))
+        self.assertEqual(given, (Path("many-objects"), (Path("x.npz"),)))
 
     def test_a_wrong_value_of_a_verb_names_the_option_and_the_help(self):
         code, out, err = run(

@@ -181,12 +181,13 @@ def perform(argv: list[str]) -> None:
     module = import_module(f"xreset.cli.{name}")
     import tyro
 
-    from xreset.cli._options import RULES, checked, description, fitted
+    from xreset.cli._options import RULES, checked, description, fitted, refuse_repeated
     from xreset.files import storage
 
     storage.INVOCATION[:] = argv
 
     def call(function: Callable[..., None], words: list[str], *verb: str) -> None:
+        refuse_repeated(function, words)
         tyro.cli(
             checked(function),
             args=words,

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, is_dataclass, replace
 from inspect import cleandoc, signature
@@ -12,9 +13,9 @@ from pathlib import Path
 from shutil import get_terminal_size
 from textwrap import fill
 from types import NoneType, UnionType
-from typing import Annotated, Any, Union, get_args, get_type_hints
+from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 
-from tyro.conf import arg
+from tyro.conf import UseAppendAction, arg
 from tyro.constructors import (
     ConstructorRegistry,
     PrimitiveConstructorSpec,
@@ -76,6 +77,41 @@ def checked(command: Callable[..., None]) -> Callable[..., None]:
             run.__annotations__[each.name] = Annotated[hints[each.name], arg(help_behavior_hint="")]
     vars(run)["__signature__"] = signature(command)
     return run
+
+
+def refuse_repeated(command: Callable[..., None], words: Iterable[str]) -> None:
+    """Refuse, with ``XResetError``, an option that takes several values and is given again, because only the last one
+    would count."""
+    flags = Counter(
+        word.partition("=")[0].replace("_", "-") for word in words if word.startswith("--")
+    )
+    again = [flag for flag, count in flags.items() if count > 1]
+    if not again:
+        return
+    for name, hint in get_type_hints(command, include_extras=True).items():
+        for flag in _flags_of_lists(f"--{name}", hint):
+            if flag in again:
+                raise XResetError(
+                    f"{flag} is given more than once. Give all of its values together: {flag} A B"
+                )
+
+
+def _flags_of_lists(name: str, hint: Any) -> Iterator[str]:
+    """Yield the options of an argument that take any number of values at once."""
+    kind = get_origin(hint)
+    if UseAppendAction in marks_in(hint):
+        return
+    if kind in (Union, UnionType):
+        for part in get_args(hint):
+            yield from _flags_of_lists(name, part)
+    elif kind is Annotated:
+        yield from _flags_of_lists(name, get_args(hint)[0])
+    elif is_dataclass(hint):
+        prefix = "--" if isinstance(hint, type) and issubclass(hint, Options) else f"{name}."
+        for field, each in get_type_hints(hint, include_extras=True).items():
+            yield from _flags_of_lists(prefix + field, each)
+    elif kind is dict or (kind is tuple and ... in get_args(hint)):
+        yield name.replace("_", "-")
 
 
 def description(command: Callable[..., None]) -> str:

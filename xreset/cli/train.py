@@ -54,10 +54,7 @@ def command_for(arguments: list[str]) -> Callable[..., None]:
         )  # the configuration has a help of its own
 
     def prepare(options: dict[str, Any]) -> None:
-        """Leave out what the configuration holds already, and a configuration that nobody gave. Unpack one bank."""
-        banks = options.get("bank", ())
-        if len(banks) == 1:
-            options["bank"] = banks[0]
+        """Leave out what the configuration holds already, and a configuration that nobody gave."""
         if given.resume:
             options["config"] = options["config"] if changes else None
         else:

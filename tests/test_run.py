@@ -46,9 +46,12 @@ class Run(InFolder, TestCase):
         with self.assertRaisesRegex(RunError, "motion.npz was made with another archive"):
             self.run_it()
 
-    def test_nothing_is_made_for_an_unknown_robot(self):
+    def test_nothing_is_made_if_a_later_step_would_refuse(self):
         demos = self.folder / "soup.npz"
         out = self.folder / "out"
         write_demos(demos, synthesize(["soup"], 1, fps=5))
-        refused("run", demos, "--robot", "nobody", "--out", out)
-        self.assertFalse(out.exists())
+        for wrong in ("--robot nobody", "--recipe nothing", "--minutes 0", "--engine none"):
+            words = f"--robot openarm {wrong}".split()
+            with patch.object(command, "perform") as performed:
+                refused("run", demos, *words, "--out", out)
+            self.assertFalse(performed.called or out.exists(), wrong)

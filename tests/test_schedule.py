@@ -5,6 +5,7 @@ import unittest
 import numpy as np
 from numpy.testing import assert_array_equal
 
+from xreset.errors import XResetError
 from xreset.resets.schedule import schedule, shared_worlds
 
 CASES = {
@@ -53,3 +54,5 @@ class ScheduleTest(unittest.TestCase):
             held = shared_worlds(names, worlds, share)
             assert_array_equal(held, np.repeat(np.arange(len(names)), expected))
         self.assertIsNone(shared_worlds("abc", 10, {}))
+        with self.assertRaisesRegex(XResetError, "2 worlds cannot hold 3 objects"):
+            shared_worlds("abc", 2, {})

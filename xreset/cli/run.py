@@ -15,7 +15,8 @@ from xreset.errors import RunError
 from xreset.files.checks import PositiveFloat, PositiveInt, Seed, obeys_rules
 from xreset.files.records import stated_inputs
 from xreset.files.storage import file_hash
-from xreset.physics.plugins import Device
+from xreset.learning.run import read_run
+from xreset.physics.plugins import Device, backend_class
 
 _MINUTES = 25.0
 """Length of the training where nothing else is said."""
@@ -68,6 +69,9 @@ def run(
     from xreset.demos.archive import read_demos
     from xreset.eval.study import steps
     from xreset.geometry.description import load_robot
+    from xreset.learning.recipes import starting_config
+    from xreset.learning.verbs import ENGINE
+    from xreset.resets.schedule import shared_worlds
     from xreset.retarget.file import read_retargeted
     from xreset.spec import check_robot
 
@@ -77,11 +81,16 @@ def run(
     spec = load_robot(robot)
     named = [engine] if isinstance(engine, str) else engine
     engines = [each.name for each in quick_engines(named, "cpu")]
+    # what the last steps would refuse, after minutes of work
+    backend_class(ENGINE).engine_version()
+    share = starting_config(recipe).task.reset.object_share
+    shared_worlds(archive.object_names, num_envs, share)
     if minutes is None and iterations is None:
         minutes = _MINUTES
     _show_times(len(archive.sequence_name), archive.num_frames, minutes, episodes, engines)
     motion = out / "motion.npz"
     bank = out / "resets.npz"
+    _refuse_other_training(out, bank)
     out.mkdir(parents=True, exist_ok=True)
     if motion.is_file():
         check_robot(motion, "file of motion", read_retargeted(motion), spec)
@@ -131,6 +140,15 @@ def _show_times(
         f"{sequences} demonstrations, {frames} frames, {cores} cores; engines: {', '.join(engines)}. "
         f"About how many minutes each step takes: {times}."
     )
+
+
+def _refuse_other_training(out: Path, bank: Path) -> None:
+    """Refuse, with ``RunError``, a run folder whose training has another bank than the folder's own."""
+    if not (out / "run.json").is_file():
+        return
+    used = Path(read_run(out).resets)
+    if used.exists() and used.resolve() != bank.resolve():
+        raise RunError(f"{out} holds a training with {used}. Choose another --out.")
 
 
 def _made_from(path: Path, **sources: str) -> bool:

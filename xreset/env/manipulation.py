@@ -90,8 +90,9 @@ def make_env(
     objects = checked_objects(robot, objects)
     check_states(bank, robot, objects)
     scene = make_scene(robot, objects, task)
-    worlds = shared_worlds([o.name for o in objects], num_envs, task.reset.object_share)
-    object_index = None if worlds is None else torch.as_tensor(worlds)
+    object_index = None
+    if share := task.reset.object_share:
+        object_index = torch.as_tensor(shared_worlds([o.name for o in objects], num_envs, share))
     backend = make_backend(engine, scene, num_envs, object_index=object_index, device=device)
     try:
         resets = ResetDistribution.of(bank, robot, objects, task, backend.device)

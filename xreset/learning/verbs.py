@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 else:  # a command has files in place of these
     ResetBank = GoalSet = Any
 
+ENGINE = "mujoco-warp"
+"""Where trainings run if nothing is said."""
 _WORLDS = 4096
 _WORLDS_OF_STUDENT = 1024
 
@@ -120,7 +122,7 @@ def train(
         return training.resume(out, own=own, **length)
     config = _configuration(config, recipe, weights, teacher, cameras, goals)
     present = read_run(out) if checkpoints(out) else None
-    engine = engine or "mujoco-warp"
+    engine = engine or ENGINE
     device = _device(device, engine, present)
     data = training.bank_or_goals(first, goals)
     load = partial(load_inputs, robot=robot, meshes=meshes, accept=("bank", "goals"))
@@ -131,8 +133,12 @@ def train(
     robots = [each.robot for each in loaded]
     if others:
         config = for_robots(config, _different(robots))
+    if num_envs is None:
+        num_envs = _WORLDS if teacher is None else _WORLDS_OF_STUDENT
     for each in loaded:
-        training.check_config(config, each, has_teacher=teacher is not None)
+        training.check_config(
+            config, each, num_envs=num_envs // len(loaded), has_teacher=teacher is not None
+        )
     version = backend_class(engine).engine_version()  # fails where the engine is missing
     start = None
     if weights is not None:
@@ -140,7 +146,6 @@ def train(
     teacher_policy = None
     if teacher is not None:
         teacher_policy = training.read_teacher(teacher, inputs, config)
-    default_worlds = _WORLDS if teacher is None else _WORLDS_OF_STUDENT
     info = RunInfo(
         robot=str(inputs.robot_name),
         resets=str(inputs.path),
@@ -149,7 +154,7 @@ def train(
         engine=engine,
         engine_version=version,
         device=device,
-        num_envs=num_envs or default_worlds,
+        num_envs=num_envs,
         seed=seed or 0,
         config=config,
         contract=policy_contract(inputs.robot, config.task, _object_names(loaded), robots[1:]),

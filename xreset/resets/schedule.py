@@ -68,8 +68,13 @@ def shared_worlds(
         share: ``task.reset.object_share``.
 
     Raises:
-        XResetError: an unknown name, or too few worlds.
+        XResetError: an unknown name, or an object gets no world.
     """
+    if num_envs < len(names):
+        raise XResetError(
+            f"{num_envs} worlds cannot hold {len(names)} objects, so some would never be trained. Take at least "
+            f"{len(names)} worlds (--num-envs), or fewer objects."
+        )
     if not share:
         return None
     if unknown := sorted(set(share) - set(names)):

@@ -450,7 +450,6 @@ class FairnessTest(Compared):
         both = "potted meat can, tomato soup can"
         for what, episodes, changes, expected in (
             ("seed", (), {"seed": 4}, r"seed of the evaluation \(3: a; 4: seed\)"),
-            ("robot", (), {"robot": "x"}, r"robot \(toy: a; x: robot\)"),
             ("ycb", (), {"meshes": "/x"}, r"object meshes \(stand-ins: a; /x: ycb\)\."),
             ("new", (), {"engine_version": "5"}, r"version of mujoco \(4.0.0: a; 5: new\)"),
             ("demos", renamed, other, r"demonstrations \(ab: a; cd: demos\)\.$"),
@@ -469,6 +468,17 @@ class FairnessTest(Compared):
             self.assertNotIn("object meshes", self.compare("here", "full"))
         self.write_results("a", engines=("sapien",), seed=9)
         words = r"seed of the evaluation \(3: a in mujoco; 9: a in sapien\)"
+        self.assertRegex(self.compare("a"), words)
+
+    def test_two_robots_may_be_compared_but_one_run_has_one(self):
+        self.write_results("a", engines=("mujoco", "sapien"))
+        self.write_results("b", engines=("mujoco", "sapien"), robot="x")
+        text = self.compare("a", "b")
+        self.assertNotIn("comparable", text)
+        self.assertIn("a: toy, b: x", text)
+        self.assertTrue(self.report.scores["metric"].str.endswith("minus a").any())
+        self.write_results("a", engines=("sapien",), robot="x")
+        words = r"not the same robot \(toy: a in mujoco; x: a in sapien\)"
         self.assertRegex(self.compare("a"), words)
 
     def test_policies_that_play_another_task(self):

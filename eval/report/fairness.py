@@ -15,7 +15,9 @@ from xreset.eval.stats import Table
 from xreset.files.text import short_name
 from xreset.learning.run import TEACHER
 
-_CONDITIONS = ("objects", "robot", "object meshes", "number of episodes", "seed of the evaluation")
+_CONDITIONS = ("objects", "object meshes", "number of episodes", "seed of the evaluation")
+_OF_ONE_TRAINING = ("robot", "policy", "policy file")
+"""Conditions in which the results of one training agree. Trainings may differ in them: they are what is compared."""
 _PLAYED_TASK = ("task.termination.", "task.reset.spawn_", "task.timestep")
 """Fields of a training's task that make its evaluation easier or harder, because the evaluation keeps them
 (:func:`xreset.task.config.evaluation_task`). An evaluation may only change the length of episodes."""
@@ -84,15 +86,15 @@ def expected(training: Training) -> list[str]:
 
 
 def uneven(trainings: Sequence[Training]) -> list[str]:
-    """Return a sentence for each condition in which the evaluations of trainings differ. For a single training, the
-    policy is one of the conditions, because all engines must have played the same one."""
+    """Return a sentence for each condition in which the evaluations of trainings differ. For a single training, robot
+    and policy are conditions, too, because all engines must have played the same ones."""
     table = _condition_table(trainings)
     if table.empty:
         return []
     tasks = sorted(name for name in table if name.startswith(_PLAYED_TASK))
     found = []
-    policy = ("policy", "policy file") if len(trainings) == 1 else ()
-    for name in (*_CONDITIONS, *tasks, *policy):
+    of_one = _OF_ONE_TRAINING if len(trainings) == 1 else ()
+    for name in (*_CONDITIONS, *tasks, *of_one):
         found += _difference(table, name, name)
     if table["objects"].nunique() == 1:
         same_names = table["sequences"].nunique() == 1

@@ -6,18 +6,15 @@ from types import SimpleNamespace
 from unittest import TestCase
 
 import numpy as np
-import torch
 from numpy.testing import assert_allclose
 
 from tests.engine_checks import EngineChecks
 from xreset.backends.conformance import run
 from xreset.backends.conformance.scene import gripper, scene, shape, solid
-from xreset.backends.rigid import friction_forces, matrix_to_quat, mechanism
+from xreset.backends.rigid import friction_forces, mechanism
 from xreset.backends.sapien import _PARTING_SPEED, SapienBackend, SapienWorld
 from xreset.backends.sapien_robot import _couple, self_collision_bits
 from xreset.errors import RobotError
-from xreset.geometry.description import load_robot
-from xreset.geometry.kinematics import Kinematics
 from xreset.spec import GRAVITY, MimicSpec, SceneSpec
 
 
@@ -59,30 +56,6 @@ class SapienTest(EngineChecks, TestCase):
         (result,) = run(SapienBackend, robot=far, only=["mimic_joints"])
         # 0.002 rad through three links; alone it would stay
         self.assertLess(max(measure.measured for measure in result.measures), 4e-3)
-
-    def test_a_jaw_with_coupled_joints_squeezes_as_virtual_work_says(self):
-        robot = load_robot("ur7e-robotiq")
-        box = solid("box", 0.3, (shape("box", (0.03, 0.02, 0.025)),))
-        world = SapienWorld(SceneSpec(robot=robot, objects=(box,)), 0)
-        position = np.array(robot.home)
-        position[-1] = 0.258  # the pads are 60 mm apart
-        target = position.copy()
-        target[-1] += 0.2
-        tips = Kinematics(robot).link_poses(torch.tensor(position), ["thumb_tip", "index_tip"])
-        state = {"joint_pos": position, "joint_vel": np.zeros(7), "joint_target": target}
-        state["object_pos"] = tips[:, :3, 3].mean(0).numpy()
-        # x of the box is out of the pads
-        turn = tips[0, :3, [2, 0, 1]].numpy()
-        state["object_quat"] = matrix_to_quat(turn)
-        state["object_linvel"] = state["object_angvel"] = np.zeros(3)
-        world.set_state(state)
-        world.step(120)
-        thumb = sum(force for owner, force in world.contacts() if owner == 0)
-        jaw = world.get_state()["joint_pos"][-1]
-        # both fingers turn bars of (37.16, 43.42) mm; kp = 25 N m
-        closing = 2 * (0.03716 * np.sin(jaw) + 0.04342 * np.cos(jaw))
-        expected = 25.0 * (target[-1] - jaw) / closing
-        self.assertLess(abs(np.linalg.norm(thumb) / expected - 1.0), 0.1)
 
     def test_an_object_deep_in_the_table_rises_at_the_limit_and_comes_to_rest(self):
         box = solid("box", 0.4, (shape("box", (0.03, 0.02, 0.025)),))

@@ -519,6 +519,15 @@ class TorsionalFrictionTimesSlidingFriction(MujocoWorld):
         )
 
 
+@breaks("coupled_jaw")
+class EveryCoupledJointWithTheWholeDrive(MujocoWorld):
+    def step(self, n):
+        follower = self._at.dof[-1]
+        for _ in range(n):
+            self._data.qfrc_applied[follower] = self._data.actuator_force[-1]
+            super().step(1)
+
+
 @remodelled("shaken_grasp")
 def weak_fingers(model, at):
     model.actuator_forcerange[-1] = (-2.5, 2.5)

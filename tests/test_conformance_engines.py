@@ -10,7 +10,7 @@ import numpy as np
 from tests.data import PYBULLET
 from tests.toy_robot import ROBOTS
 from xreset.backends.conformance import CHECKS, run
-from xreset.geometry.description import read_description
+from xreset.geometry.description import load_robot, read_description
 from xreset.geometry.dynamics import drive_inertia
 from xreset.physics.plugins import backend_status, make_backend
 
@@ -64,6 +64,11 @@ class EveryBackend(unittest.TestCase):
         for backend in BACKENDS:
             with self.subTest(backend=backend):
                 self.passes(backend)
+
+    def test_couplings_below_their_source_make_no_work(self):
+        for backend in BACKENDS:
+            with self.subTest(backend=backend):
+                self.passes(backend, robot=load_robot("ur7e-robotiq"), only=["coupled_jaw"])
 
     @PYBULLET  # whose data package has the robot
     def test_a_robot_of_another_package(self):

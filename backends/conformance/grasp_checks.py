@@ -1,17 +1,26 @@
-"""Checks of a brick held by the suite's own robot: forces of fingers, friction of fingertips, whether a grasp lasts."""
+"""Checks of grasps: forces of fingers, friction of fingertips, whether a grasp lasts.
+
+The suite's own robot holds a brick; the jaw of any robot with couplings presses on a ball.
+"""
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from xreset.backends.conformance.harness import SETTLE, Bench, Worlds
-from xreset.backends.conformance.results import Measured
+from xreset.backends.conformance.results import Measured, Skipped
+from xreset.backends.conformance.scene import ball
 from xreset.geometry.rotations import matrix_to_quat, quat_angle, relative_pose
 from xreset.physics import State
-from xreset.spec import GRAVITY
+from xreset.spec import GRAVITY, ObjectSpec
+
+_BALL_WIDTH = 0.06  # m
+_HEAVY = 1000.0  # times as heavy as the suite's ball, so that it hardly moves
+_SQUEEZE = 0.2  # of the drive's effort limit
 
 
 def held_object(bench: Bench) -> Measured:
@@ -77,6 +86,57 @@ def tip_friction(bench: Bench) -> Measured:
         "slip at mu = 0.9": fallen[held],
         "fall missing at mu = 0.05": max(0.0, 0.1 - float(fallen[dropped])),
     }
+
+
+def coupled_jaw(bench: Bench) -> Measured:
+    """Close a jaw of coupled joints on a heavy ball, and compare the work of its fingers with that of its drive.
+
+    A coupling makes no work. So at rest, when the drive's joint moves by dq, the work of all fingers on the ball, force
+    times way of the tip, is the drive's kp (target - q) dq. How the fingers share the force does not matter.
+    """
+    robot = replace(bench.free_scene.robot, gravity_compensated=True)
+    scene = replace(bench.free_scene, robot=robot, objects=(_heavy_ball(),))
+    joint, opening, closing = _jaw(bench)
+    drive = robot.joints[joint].drive
+    start = bench.initial(scene, [0])
+    start.joint_pos[0, joint] = opening
+    start.joint_target[0] = start.joint_pos[0]
+    start.joint_target[0, joint] += closing * _SQUEEZE * drive.effort / drive.kp
+    tips = [tip.link for tip in robot.fingertips]
+    start.object_pos[0] = bench.kinematics.points(start.joint_pos[0].double(), tips).mean(0)
+    with bench.other(scene) as worlds:
+        worlds.set_parameter("object_gravity", torch.zeros(1))
+        end = worlds.advance(start, 2 * SETTLE)
+        force = worlds.contacts().tip_force[0].double()
+    rates = bench.kinematics.jacobian(end.joint_pos[0].double(), tips).linear[..., joint]
+    asked = drive.kp * (end.joint_target - end.joint_pos)[0, joint]
+    return {"force of the fingers": (force * rates).sum() / asked - 1.0}
+
+
+def _heavy_ball() -> ObjectSpec:
+    light = ball()
+    return replace(light, mass=_HEAVY * light.mass, inertia=_HEAVY * light.inertia)
+
+
+def _jaw(bench: Bench) -> tuple[int, float, float]:
+    """Return index of the joint that closes two fingertips, where they are as far apart as the ball is wide, and the
+    sign of its closing; ``Skipped`` if no joint with couplings does."""
+    robot = bench.scene.robot
+    kinematics = bench.kinematics
+    tips = [tip.link for tip in robot.fingertips]
+    for source in dict.fromkeys(mimic.source for mimic in robot.mimics):
+        joint = robot.joint_names.index(source)
+        moved = kinematics.jacobian(kinematics.home, tips).linear[..., joint]
+        if len(tips) != 2 or not moved.any(dim=-1).all():
+            continue
+        q = kinematics.home.repeat(1000, 1)
+        q[:, joint] = torch.linspace(kinematics.lower[joint], kinematics.upper[joint], len(q))
+        pads = kinematics.points(q, tips)
+        apart = (pads[:, 0] - pads[:, 1]).norm(dim=-1)
+        nearest = int((apart - _BALL_WIDTH).abs().argmin())
+        if abs(float(apart[nearest]) - _BALL_WIDTH) < 1e-3:
+            return joint, float(q[nearest, joint]), float((apart[0] - apart[-1]).sign())
+    raise Skipped("no joint with couplings of this robot closes two fingertips on a ball of 60 mm")
 
 
 def grasp(bench: Bench) -> tuple[State, Tensor]:

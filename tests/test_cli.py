@@ -153,6 +153,13 @@ class UsageTest(TestCase):
                 self.assertRegex(err + out, words)
                 self.assertNotIn("Traceback", err)
 
+    def test_a_word_in_place_of_a_number_is_named(self):
+        for flag, words in (
+            ("--iterations 1e3", "found '1e3', expected a whole number"),
+            ("--minutes ten", "found 'ten', expected a number"),
+        ):
+            self.assertIn(words, "".join(run("train", "--out", "x", *flag.split())[1:]))
+
     def test_earlier_names_of_flags_are_taken(self):
         for words, told in (
             ("engines check --backend bulet", ["--backend is now --engine"]),

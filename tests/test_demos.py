@@ -529,6 +529,10 @@ class Commands(InFolder):
             "Nothing was overwritten",
             refused("demos", "select", file, "--out", left, "--rest", left, "--share", 0.5),
         )
+        one = f"{self.folder}/one.npz"
+        write_demos(one, synthesize(["banana"], 1, fps=10))
+        said = succeeds("demos", "select", file, one, "--per-object", "1", "--rest", rest)
+        self.assertIn("011_banana: no sequence is left", said)
 
     def test_import(self):
         file = self.folder / "demos.npz"

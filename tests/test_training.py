@@ -55,6 +55,7 @@ from xreset.learning.run import (
     read_run,
 )
 from xreset.learning.runner import TrainingRunner, _stop_on_interrupt
+from xreset.learning.train import cleanly
 from xreset.policy.onnx_policy import check_contract
 from xreset.task.config import RandomizationConfig, RewardConfig, TaskConfig
 
@@ -800,6 +801,15 @@ class TrainingTest(WithBank):
             with stopped, redirect_stderr(said), self.assertRaisesRegex(RunError, "stopped"):
                 self.train(f"worlds{worlds}", num_envs=worlds)
             self.assertEqual("--num-envs 8" in said.getvalue(), warned)
+
+    def test_worlds_that_do_not_divide_into_minibatches_are_named(self):
+        info = replace(read_run(self.out), device="cuda", config=TrainConfig())
+        for worlds, words in ((4097, "Take 4,096 worlds"), (4096, "^$")):
+            with (
+                redirect_stderr(io.StringIO()) as said,
+                cleanly(self.out, replace(info, num_envs=worlds)),
+            ):
+                self.assertRegex(said.getvalue(), words)
 
     def test_a_damaged_checkpoint_is_named(self):
         file = self.folder / "000009.pt"

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, is_dataclass, replace
 from inspect import cleandoc, signature
+from numbers import Integral, Real
 from pathlib import Path
 from shutil import get_terminal_size
 from textwrap import fill
@@ -160,6 +161,29 @@ def _group(info: StructTypeInfo) -> StructConstructorSpec | None:
         text = field.helptext() if callable(field.helptext) else field.helptext
         fields.append(replace(field, helptext=" ".join(text.split()) if text else None))
     return replace(spec, fields=tuple(fields))
+
+
+@RULES.primitive_rule
+def _number(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
+    """Read numbers as tyro does, and say in plain words what is none."""
+    kind = info.type
+    if kind not in (int, float):
+        return None
+    expected = "a whole number" if kind is int else "a number"
+
+    def read(words: list[str]) -> Any:
+        try:
+            return kind(words[0])
+        except ValueError:
+            raise ValueError(f"found {words[0]!r}, expected {expected}") from None
+
+    return PrimitiveConstructorSpec(
+        nargs=1,
+        metavar=kind.__name__.upper(),
+        instance_from_str=read,
+        is_instance=lambda value: isinstance(value, Integral if kind is int else Real),
+        str_from_instance=lambda value: [str(value)],
+    )
 
 
 @RULES.primitive_rule

@@ -231,7 +231,7 @@ def select_demos(
             not their own mirror image are listed and left out.
         meshes: folder of real meshes, to examine the recordings with, and whose symmetry --mirror needs; default: the
             built-in stand-ins.
-        say: called with a line about each mirrored object.
+        say: called with a line about each mirrored object, and about each object that only one of the two archives has.
 
     Returns:
         The sequences that meet the conditions; and, if they have a file, the others.
@@ -249,12 +249,21 @@ def select_demos(
     else:
         kept, others = demos.split(**selection.conditions())
         write_demos(rest, others, config={"select_others": asdict(selection)}, inputs=inputs)
+        if not selection.objects:
+            _name_missing(kept, others, str(rest), say)
+            _name_missing(others, kept, str(out or "the selection"), say)
     if mirror:
         kept = _mirrored(kept.select(sides=["left"]), meshes, say)
     if out is not None:
         config = {"select": asdict(selection), "mirrored": mirror}
         write_demos(out, kept, config=config, inputs=inputs)
     return kept, others
+
+
+def _name_missing(demos: Demos, other: Demos, name: str, say: Callable[[str], None]) -> None:
+    """Name the objects of demonstrations that the other part of them, which has a name, lacks."""
+    for missing in sorted({*demos.object_names} - {*other.object_names}):
+        say(f"{missing}: no sequence is left for {name}")
 
 
 def _mirrored(demos: Demos, meshes: str | Path | None, say: Callable[[str], None]) -> Demos:

@@ -392,6 +392,14 @@ def cleanly(out: Path, info: RunInfo) -> Iterator[None]:
             "training runs, 8 worlds are enough (--num-envs 8).",
             file=sys.stderr,
         )
+    minibatches = info.config.ppo.minibatches(info.num_envs)
+    left = info.num_envs % minibatches
+    if info.device != "cpu" and left:
+        print(
+            f"{info.num_envs:,} worlds cannot be divided into {minibatches} minibatches of one size, which a GPU needs "
+            f"for fast updates. Take {info.num_envs - left:,} worlds (--num-envs).",
+            file=sys.stderr,
+        )
     with ExitStack() as stack:
         stack.callback(torch.set_float32_matmul_precision, torch.get_float32_matmul_precision())
         if not torch.distributed.is_initialized():

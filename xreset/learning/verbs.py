@@ -125,7 +125,8 @@ def train(
     engine = engine or ENGINE
     device = _device(device, engine, present)
     data = training.bank_or_goals(first, goals)
-    load = partial(load_inputs, robot=robot, meshes=meshes, accept=("bank", "goals"))
+    accept = ("goals",) if first is None else ("bank", "goals")
+    load = partial(load_inputs, robot=robot, meshes=meshes, accept=accept)
     inputs = load(data)
     if isinstance(inputs.data, GoalSet):
         config = from_home(config)

@@ -311,9 +311,10 @@ def finite_limits(kinematics: Kinematics, most: float = 3.0) -> tuple[Tensor, Te
 
 
 def small_motion(kinematics: Kinematics) -> Tensor:
-    """[J] a small distance for each joint, towards the middle of its range."""
+    """[J] a small distance for each joint, towards the middle of its range. It is at most 0.2 rad: an arm that turns
+    farther gets to the table."""
     lower, upper = finite_limits(kinematics)
-    step = 0.05 * (upper - lower)
+    step = (0.05 * (upper - lower)).clamp(max=0.2)
     return torch.where(kinematics.home > (lower + upper) / 2, -step, step).float()
 
 

@@ -55,9 +55,9 @@ _EFFORTS = {
     ("arm", "prismatic"): (20.0, 30_000.0),
 }
 """[N m or N] Effort limits that are believed."""
-_STABLE = 0.8
+_STABLE = {"hand": 0.8, "arm": 0.3}
 """Share of the largest kp that is stable in engines that integrate drives explicitly: kd times the step stays below the
-inertia."""
+inertia. With stiffer arms, MuJoCo's steps differ from finer ones by more than its check allows."""
 _HOME_PALM = (0.57, 0.45, 0.25)
 """[m] Position of the palm at home: above the table, looking down, fingers away from the person."""
 _ALONG = 0.9
@@ -389,7 +389,7 @@ def _with_drives(spec: RobotSpec, tree: RobotTree, notes: list[str]) -> RobotSpe
         else:
             kp = float(np.clip(effort / 0.35, 0.5, 10))
             factor = 1.8
-        stable = float(f"{_STABLE * inertia / (factor * SceneSpec.timestep) ** 2:.3g}")
+        stable = float(f"{_STABLE[joint.group] * inertia / (factor * SceneSpec.timestep) ** 2:.3g}")
         if joint.group == "hand" and stated.stiffness > stable:
             softer.append(f"{joint.name} ({stated.stiffness:g})")
             kp = stable if stated.stiffness <= 10 * kp else min(kp, stable)

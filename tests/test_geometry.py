@@ -9,10 +9,16 @@ from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from torch.testing import assert_close
 
+from tests import toy_grasp
 from tests.toy_retarget import UPRIGHT, box_object, double
 from xreset import robots
 from xreset.geometry.balls import BARE, SPACING, inscribed_balls, link_balls, sharp_points
-from xreset.geometry.collision import SelfCollision, bounding_ball, height_above_table
+from xreset.geometry.collision import (
+    SelfCollision,
+    bounding_ball,
+    height_above_table,
+    object_depth,
+)
 from xreset.geometry.fields import DistanceFields
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import quat_to_matrix
@@ -155,6 +161,48 @@ class ShapesTest(TestCase):
         heights = height_above_table(points, double([0.01, 0.01]), table)
         self.assertAlmostEqual(heights[0].item(), 0.02)
         self.assertEqual(heights[1], float("inf"))
+
+
+class ObjectDepthTest(TestCase):
+    """The gripper around its brick, whose jaws close into it, and another object."""
+
+    robot = toy_grasp.robot()
+    objects = (box_object(((0, 0, 0), (0.1, 0.1, 0.1))), toy_grasp.brick())
+
+    def depth(self, names, joints, pos, quat):
+        return object_depth(self.robot, self.objects, np.array(names), joints, pos, quat)
+
+    def test_jaws_are_as_deep_as_they_close_wherever_the_object_is(self):
+        joints = np.tile(self.robot.home, (4, 1))
+        joints[2:, self.robot.joint_names.index("turn")] += 0.5
+        poses = [toy_grasp.brick_pose(each) for each in joints]
+        pos, quat = map(np.array, zip(*poses, strict=True))
+        jaw = self.robot.joint_names.index("jaw_a_slide")
+        joints[:, jaw] = toy_grasp.OPEN - np.array([0.0, 0.003, 0.001, 0.003])
+        found = self.depth(["brick"] * 4, joints, pos, quat)
+        # jaw_b, which goes 1.1 times as far, begins 0.11 mm from the brick
+        assert_allclose(found, [0.0, 0.00319, 0.00099, 0.00319], atol=1e-6)
+
+    def test_each_state_has_its_own_object_and_the_arm_counts(self):
+        joints = np.tile(self.robot.home, (3, 1))
+        kinematics = Kinematics(self.robot)
+        arm = next(
+            link
+            for link in kinematics.link_names
+            if kinematics.tree.link(link).collisions
+            and link not in Kinematics(self.robot, root=self.robot.hand_root).link_names
+        )
+        shape = kinematics.tree.link(arm).collisions[0]
+        at = (
+            kinematics.link_poses(torch.as_tensor(joints), [arm])[0, 0].numpy() @ shape.T_body_shape
+        )
+        pos = np.array([at[:3, 3], at[:3, 3] + 3.0, at[:3, 3]])
+        quat = np.tile([1.0, 0, 0, 0], (3, 1))
+        name = self.objects[0].name
+        found = self.depth([name, name, "brick"], joints, pos, quat)
+        self.assertGreater(found[0], 0.05)
+        self.assertEqual(found[1], 0.0)
+        self.assertNotEqual(found[2], found[0])
 
 
 class SelfCollisionTest(TestCase):

@@ -11,6 +11,7 @@ from numpy.testing import assert_allclose
 from tests.toy_bank import ONLY_FRAMES, SOUP, SPAM, in_this_process, toy_retargeted
 from xreset import FilterConfig, SqueezeConfig, robots
 from xreset.errors import DemoError
+from xreset.geometry.kinematics import Kinematics
 from xreset.objects.catalogue import load_objects
 from xreset.objects.rest import rest_height
 from xreset.physics import Health, State
@@ -124,6 +125,19 @@ class FilterTest(TestCase):
         found = [(a.object_name, a.phase, a.kept, a.total) for a in accounts[:2]]
         self.assertEqual(found, [(SOUP, "pre-contact", 1, 2), (SOUP, "post-contact", 1, 1)])
         self.assertEqual(accounts[-1].lost, {"object linear velocity": 1})
+
+    def test_a_state_with_the_robot_deep_in_the_object_is_not_tried(self):
+        motion = self.retargeted()
+        pos = motion.object_pos.copy()
+        pos[1] = (
+            Kinematics(self.robot)
+            .points(torch.as_tensor(self.robot.home), [self.robot.palm])[0]
+            .numpy()
+        )
+        pressed = replace(motion, object_pos=pos)
+        bank = make_bank(pressed, self.robot, self.objects, **ONLY_FRAMES)
+        self.assertEqual(reasons(bank), ["object collision"])
+        self.assertEqual(bank.object_depth.tolist(), [0.0] * 4)
 
     def tried(self, verdicts, **options):
         """The bank, and the objects, states and steps of each try; ``verdicts`` are the reasons that each try gives."""

@@ -409,7 +409,8 @@ class PipelineTest(InOneFolder):
         deepest_finger = -fingers.gap.amin(dim=1).numpy()
         seen = result.annotated
         assert_array_equal(np.isfinite(result.object_depth), seen)
-        self.assertTrue((result.object_depth[seen] >= deepest_finger[seen] - 1e-9).all())
+        # the fingers' balls are inside their shapes, and their distances from a grid
+        self.assertTrue((result.object_depth[seen] >= deepest_finger[seen] - 1e-3).all())
         self.assertLess(result.object_depth[seen].max(), 0.004)
         self.assertLessEqual(result.object_depth[result.valid].max(), 0.002)
         touching = np.isfinite(result.contact_error)
@@ -462,7 +463,7 @@ class PipelineTest(InOneFolder):
         write_demos(f"{self.folder}/demos.npz", self.demos.select(indices=[0]))
         said = self.commanded("demos", "openarm")
         self.assertIn("005_toma", said)
-        self.assertRegex(said, r"fingertips are [\d.]+ mm .* touch; in valid frames .* deep")
+        self.assertRegex(said, r"fingertips are [\d.]+ mm .* touch; in frames .* over 2 mm\)")
         with np.load(f"{self.folder}/demos-robot.npz") as file:
             used = json.loads(str(file["meta"]))["config"]["retarget"]
         self.assertEqual(used["arm"]["restarts"], 8)

@@ -226,6 +226,17 @@ class TransferTest(TestCase):
         found, calls = tried(self.bank, replace(self.data, object_pos=pos))
         self.assertEqual((found.num_states, calls), (3, []))
 
+    def test_grasps_that_are_deep_in_the_object_are_not_tried(self):
+        deep = self.bank.joint_pos.copy()
+        deep[2, JAW] -= 0.003
+        base = replace(self.bank, joint_pos=deep, object_depth=np.float32([0, 0, 0.003]))
+        found, calls = tried(base, self.data)
+        self.assertEqual(len(calls[0][2]), 3)
+        self.assertEqual(found.frame_index[3:].tolist(), [1, 2, 3])
+        self.assertEqual(found.object_depth.dtype, np.float32)
+        assert_array_equal(found.object_depth[:3], base.object_depth)
+        self.assertTrue((found.object_depth[3:] <= 0.002).all())
+
     def test_one_demonstration_of_each_object_gets_no_state(self):
         owners = np.array([BRICK, "bracket", CAN])
         data = replace(self.data, object_name=owners)
@@ -377,6 +388,7 @@ class CommandTest(InFolder):
         for words in (
             "3 states of 3 kept",
             "2 states in grasps of other demonstrations added, to 1 of 3 demonstrations",
+            "in all states the robot is at most 0.0 mm deep in the object (0.0% over 2 mm)",
         ):
             self.assertIn(words, " ".join(out.split()))
         self.assertEqual(bank.frame_index[bank.transferred].tolist(), [1, 3])

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from xreset.cli._terminal import console, show_table
 from xreset.physics.plugins import backend_names, backend_status
 from xreset.retarget.accounts import Account, described
@@ -47,3 +49,9 @@ def show_accounts(rows: Sequence[Account], title: str) -> None:
         kept = f"{row.kept} ({row.kept / row.total:.0%})" if row.total else "0"
         table.append((row.object_name, row.phase, str(row.total), kept, described(row.lost)))
     show_table(table, title=title)
+
+
+def depth_text(depth: np.ndarray, what: str) -> str:
+    """Return how deep the robot is in the object, for depths [N] of frames or states [m] and their name."""
+    deep = np.mean(depth > 0.002)
+    return f"in {what} the robot is at most {1e3 * depth.max():.1f} mm deep in the object ({deep:.1%} over 2 mm)"

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from xreset.cli._common import show_accounts
+from xreset.cli._common import depth_text, show_accounts
 from xreset.cli._terminal import console
 from xreset.cli._verbs import REQUIRED, verb
 from xreset.resets import verbs
@@ -32,6 +32,8 @@ def _show(bank: ResetBank, options: Mapping[str, Any]) -> None:
             f"{len(added)} states in grasps of other demonstrations added, to {len(np.unique(added))} of "
             f"{len(bank.sequence_name)} demonstrations"
         )
+    if bank.object_depth is not None and bank.num_states:
+        console.print(depth_text(bank.object_depth, "all states"))
 
 
 COMMAND = verb(verbs.make_bank, _show, out=REQUIRED)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from xreset.cli._common import show_accounts
+from xreset.cli._common import depth_text, show_accounts
 from xreset.cli._terminal import console, show_notes
 from xreset.cli._verbs import REQUIRED, verb
 from xreset.retarget import verbs
@@ -50,9 +50,11 @@ def _distances(motion: Retargeted) -> str:
     if motion.contact_error is not None and np.isfinite(motion.contact_error).any():
         touching = np.isfinite(motion.contact_error)
         text += f", links {1e3 * motion.contact_error[touching].mean():.1f} mm from the points that they touch"
-    if motion.object_depth is not None and motion.valid.any():
-        depth = 1e3 * motion.object_depth[motion.valid].max()
-        text += f"; in valid frames the hand is at most {depth:.1f} mm deep in the object"
+    reason = np.asarray(motion.reason_names)[motion.reason]
+    followed = np.isin(reason, ("valid", "object collision"))
+    if motion.object_depth is not None and followed.any():
+        depth = motion.object_depth[followed]
+        text += f"; {depth_text(depth, 'frames that are valid otherwise')}"
     return text
 
 

@@ -1,28 +1,33 @@
-"""How far a robot is from the table and from itself.
+"""How far a robot is from the table and from itself, and how deep it is in an object.
 
 The table needs no collision library: the lowest point of a convex shape is one of a few support points, less a radius.
-Self-collision asks coal for signed distances, but only for pairs of shapes whose bounding spheres are near.
+The others ask coal for signed distances, but only for pairs of shapes whose bounding spheres are near.
 
-Shape letters: B configurations, L links, G shapes, H support points, A pairs of shapes that are near each other.
+Shape letters: B configurations, L links, G shapes, H support points, M states, J joints, K pieces of an object.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterator, Sequence
 from itertools import combinations
 
 import numpy as np
+import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
 from xreset.errors import needs
 from xreset.geometry.kinematics import Kinematics
+from xreset.geometry.rotations import quat_to_matrix
 from xreset.geometry.shapes import transformed
 from xreset.geometry.urdf import RobotTree
-from xreset.spec import Geometry, RobotSpec, Shape, TableSpec
+from xreset.physics.tensors import one_thread
+from xreset.spec import Geometry, ObjectSpec, RobotSpec, Shape, TableSpec
 
 _RIM_POINTS = 16
 """Support points on each rim of a cylinder."""
+_AT_ONCE = 512
+"""States whose shapes are compared with an object's at a time; limits the memory that this takes."""
 
 
 def support_points(shape: Shape) -> tuple[np.ndarray, float]:
@@ -94,6 +99,47 @@ def table_clearance(kinematics: Kinematics, q: Tensor, table: TableSpec) -> Tens
     return height_above_table(centers, q.new_tensor(radii), table).amin(dim=-1)
 
 
+class _LinkShapes:
+    """Collision shapes of a robot's links (length G), with balls around them."""
+
+    def __init__(self, kinematics: Kinematics, links: Collection[str]) -> None:
+        """Prepare the shapes of these links; ``XResetError`` if coal is not installed."""
+        with needs("coal, which measures collisions,", "retarget"):
+            import coal
+        self.coal = coal
+        self.link: list[str] = []
+        """Link of each shape."""
+        self.geometry = []
+        local = []
+        centers = []
+        radii = []
+        for name in kinematics.link_names:
+            if name not in links:
+                continue
+            for shape in kinematics.tree.link(name).collisions:
+                center, radius = bounding_ball(*support_points(shape))
+                self.link.append(name)
+                self.geometry.append(coal_geometry(coal, shape.geometry))
+                local.append(shape.T_body_shape)
+                centers.append(center)
+                radii.append(radius)
+        self.index = [kinematics.link_index(name) for name in self.link]
+        """Links, as indices into the kinematics' links."""
+        self.T_link_shape = np.array(local).reshape(-1, 4, 4)
+        self.radius = np.array(radii)
+        """[G] radius of the ball around each shape [m]."""
+        self._center = np.array(centers).reshape(-1, 3)
+
+    def centers(self, T: np.ndarray) -> np.ndarray:
+        """[B, G, 3] centers of the balls, at poses [B, G, 4, 4] of the shapes' links."""
+        return np.einsum("bgij,gj->bgi", T[..., :3, :3], self._center) + T[..., :3, 3]
+
+    def pose(self, T: np.ndarray, shape: int) -> tuple:
+        """Return a shape as coal wants it, at a pose [4, 4] of its link."""
+        T = T @ self.T_link_shape[shape]
+        return self.geometry[shape], self.coal.Transform3s(T[:3, :3], T[:3, 3])
+
+
 class SelfCollision:
     """Distances between the shapes of a robot's links."""
 
@@ -116,31 +162,10 @@ class SelfCollision:
         Raises:
             XResetError: coal is not installed.
         """
-        with needs("coal, which measures self-collision,", "retarget"):
-            import coal
-        self._coal = coal
-        self._link: list[str] = []
-        self._geometry = []
-        local = []
-        centers = []
-        radii = []
-        for name in kinematics.link_names:
-            if only is not None and name not in only:
-                continue
-            for shape in kinematics.tree.link(name).collisions:
-                center, radius = bounding_ball(*support_points(shape))
-                self._link.append(name)
-                self._geometry.append(coal_geometry(coal, shape.geometry))
-                local.append(shape.T_body_shape)
-                centers.append(center)
-                radii.append(radius)
-        self._index = [kinematics.link_index(name) for name in self._link]
-        self._T_link_shape = np.array(local).reshape(-1, 4, 4)
-        self._center = np.array(centers).reshape(-1, 3)
-        self._radius = np.array(radii)
+        self._shapes = _LinkShapes(kinematics, kinematics.link_names if only is None else only)
         robot = kinematics.robot
         tree = kinematics.tree
-        pairs = combinations(dict.fromkeys(self._link), 2)
+        pairs = combinations(dict.fromkeys(self._shapes.link), 2)
         counted = [pair for pair in pairs if _may_collide(robot, tree, *pair)]
         if moved_by_arm:
             arm = [robot.joint_names[i] for i in robot.arm_indices]
@@ -161,9 +186,11 @@ class SelfCollision:
         """Measure only these pairs of links from now on."""
         self.link_pairs = link_pairs
         """Pairs of links that count."""
-        shapes = combinations(range(len(self._link)), 2)
+        link = self._shapes.link
         counted = set(link_pairs)
-        pairs = [(i, j) for i, j in shapes if (self._link[i], self._link[j]) in counted]
+        pairs = [
+            (i, j) for i, j in combinations(range(len(link)), 2) if (link[i], link[j]) in counted
+        ]
         self._pairs = np.array(pairs, dtype=np.int64).reshape(-1, 2)
 
     def near(self, link_poses: np.ndarray, margin: float) -> dict[tuple[int, str, str], float]:
@@ -173,28 +200,24 @@ class SelfCollision:
             link_poses: [B, L, 4, 4] poses of all links of the kinematics.
             margin: distance [m]; negative where links overlap.
         """
-        request = self._coal.DistanceRequest()
-        request.enable_signed_distance = True
-        result = self._coal.DistanceResult()
+        shapes = self._shapes
+        distance_of = _signed_distance(shapes.coal)
         first, second = self._pairs.T
-        reach = self._radius[first] + self._radius[second] + margin
-        T = link_poses[:, self._index]  # [B, G, 4, 4]
-        centers = np.einsum("bgij,gj->bgi", T[..., :3, :3], self._center) + T[..., :3, 3]
+        reach = shapes.radius[first] + shapes.radius[second] + margin
+        T = link_poses[:, shapes.index]  # [B, G, 4, 4]
+        centers = shapes.centers(T)
         gap = np.linalg.norm(centers[:, first] - centers[:, second], axis=-1)
         found: dict[tuple[int, str, str], float] = {}
+        placed: dict[tuple[int, int], tuple] = {}
+        pairs = self._pairs.tolist()
         for b, pair in np.argwhere(gap < reach).tolist():
-            arguments = []
-            for shape in self._pairs[pair]:
-                pose = T[b, shape] @ self._T_link_shape[shape]
-                arguments += [
-                    self._geometry[shape],
-                    self._coal.Transform3s(pose[:3, :3], pose[:3, 3]),
-                ]
-            result.clear()
-            distance = self._coal.distance(*arguments, request, result)
+            i, j = pairs[pair]
+            for shape in (i, j):
+                if (b, shape) not in placed:
+                    placed[b, shape] = shapes.pose(T[b, shape], shape)
+            distance = distance_of(*placed[b, i], *placed[b, j])
             if distance < margin:
-                i, j = self._pairs[pair]
-                key = (b, self._link[i], self._link[j])
+                key = (b, shapes.link[i], shapes.link[j])
                 found[key] = min(distance, found.get(key, margin))
         return found
 
@@ -218,6 +241,117 @@ def _may_collide(robot: RobotSpec, tree: RobotTree, a: str, b: str) -> bool:
         for one, other in robot.collision_exclude
     ]
     return bodies not in excluded
+
+
+@one_thread()
+def object_depth(
+    robot: RobotSpec,
+    objects: Sequence[ObjectSpec],
+    object_name: np.ndarray,
+    joint_pos: np.ndarray,
+    object_pos: np.ndarray,
+    object_quat: np.ndarray,
+) -> np.ndarray:
+    """Measure how deep a robot is in the objects of states.
+
+    The depth of two convex shapes is the shortest way by which one of them must move until they are apart, as physics
+    engines measure it. Of all pairs of a link's shape and a piece of the object, the largest depth counts.
+
+    Args:
+        robot: the robot; its arm counts as well.
+        objects: geometry of the states' objects.
+        object_name: [M] object of each state.
+        joint_pos: [M, J]
+        object_pos: [M, 3]
+        object_quat: [M, 4]
+
+    Returns:
+        [M] depth [m], 0 where they are apart.
+
+    Raises:
+        XResetError: coal is not installed.
+    """
+    kinematics = Kinematics(robot)
+    shapes = _LinkShapes(kinematics, kinematics.link_names)
+    depth = np.zeros(len(object_name))
+    for obj in objects:
+        own = np.flatnonzero(object_name == obj.name)
+        pieces = _Pieces(shapes.coal, obj.pieces)
+        for first in range(0, len(own), _AT_ONCE):
+            rows = own[first : first + _AT_ONCE]
+            q = torch.as_tensor(joint_pos[rows], dtype=torch.float64)
+            T = kinematics.link_poses(q, shapes.link).numpy()
+            turn = quat_to_matrix(torch.as_tensor(object_quat[rows], dtype=torch.float64)).numpy()
+            # in the object's frame
+            T[..., :3, 3] -= object_pos[rows, None]
+            T[..., :3, :] = turn.swapaxes(1, 2)[:, None] @ T[..., :3, :]
+            for row, distance in _overlaps(shapes, pieces, T):
+                depth[rows[row]] = max(depth[rows[row]], -distance)
+    return depth
+
+
+class _Pieces:
+    """Pieces of an object (length K), with boxes around them."""
+
+    def __init__(self, coal, pieces: Sequence[Shape]) -> None:
+        self.placed = []
+        """coal's geometry and pose of each piece."""
+        boxes = []
+        for piece in pieces:
+            geometry = coal_geometry(coal, piece.geometry)
+            geometry.computeLocalAABB()
+            T = piece.T_body_shape
+            self.placed.append((geometry, coal.Transform3s(T[:3, :3], T[:3, 3])))
+            boxes.append((geometry.aabb_local.min_, geometry.aabb_local.max_))
+        T = np.array([piece.T_body_shape for piece in pieces])
+        self._T_piece_object = np.linalg.inv(T)
+        self._low, self._high = np.array(boxes).swapaxes(0, 1)
+        half = np.abs(T[:, :3, :3]) @ ((self._high - self._low) / 2)[..., None]
+        middle = T[:, :3, :3] @ ((self._high + self._low) / 2)[..., None] + T[:, :3, 3:]
+        self._bounds = (middle - half)[..., 0].min(axis=0), (middle + half)[..., 0].max(axis=0)
+
+    def near(self, points: np.ndarray, distance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Find the boxes that are nearer to points [A, 3] in the object's frame than distances [A]: the indices of
+        points, ascending, and of pieces."""
+        gap = np.linalg.norm(points - points.clip(*self._bounds), axis=-1)
+        rows = np.flatnonzero(gap < distance)
+        T = self._T_piece_object
+        local = points[rows] @ T[:, :3, :3].swapaxes(1, 2) + T[:, None, :3, 3]  # [K, rows, 3]
+        beyond = local - local.clip(self._low[:, None], self._high[:, None])
+        gap = np.linalg.norm(beyond, axis=-1).T
+        row, piece = np.nonzero(gap < distance[rows, None])
+        return rows[row], piece
+
+
+def _overlaps(shapes: _LinkShapes, pieces: _Pieces, T: np.ndarray) -> Iterator[tuple[int, float]]:
+    """Yield the state and the signed distance [m] of each pair of a link's shape and a piece that overlap, at poses
+    [M, G, 4, 4] of the shapes' links in the object's frame."""
+    distance_of = _signed_distance(shapes.coal)
+    count = len(shapes.radius)
+    near = pieces.near(shapes.centers(T).reshape(-1, 3), np.tile(shapes.radius, len(T)))
+    before = -1
+    placed: tuple = ()
+    for item, piece in zip(*(indices.tolist() for indices in near), strict=True):
+        row, shape = divmod(item, count)
+        if item != before:
+            placed = shapes.pose(T[row, shape], shape)
+            before = item
+        distance = distance_of(*placed, *pieces.placed[piece])
+        if distance < 0:
+            yield row, distance
+
+
+def _signed_distance(coal):
+    """Return a function of two placed shapes that computes their signed distance [m]."""
+    request = coal.DistanceRequest()
+    request.enable_signed_distance = True
+    result = coal.DistanceResult()
+
+    def distance_of(*placed) -> float:
+        result.clear()
+        return coal.distance(*placed, request, result)
+
+    return distance_of
 
 
 def coal_geometry(coal, geometry: Geometry):

@@ -109,6 +109,8 @@ class ResetBank(Brief):
     frame_part: Annotated[np.ndarray, Field(("L",), "f", within=(0.0, 1.0))] | None = None
     """[L] how far a state is on the way from its frame to the next, in [0, 1); None: every state is a frame."""
     rejected_frame_part: Annotated[np.ndarray, Field(("C",), "f", within=(0.0, 1.0))] | None = None
+    object_depth: Annotated[np.ndarray, Field(("L",), "f", within=(0.0, inf))] | None = None
+    """[L] depth of the robot in the object [m] (:func:`xreset.geometry.collision.object_depth`), 0 outside it."""
     transferred: Annotated[np.ndarray, Field(("L",), "b")] | None = None
     """[L] bool: whether the hand has a grasp of another demonstration, which holds the object at full weight in all
     ``engines`` (:func:`xreset.resets.transfer.add_transfers`); None: no state has (:attr:`own_grasp`)."""

@@ -1,7 +1,8 @@
 """Make a reset bank: the physics filter keeps the retargeted states that stay put (the paper's appendix D.c).
 
 Each candidate is spawned at rest, the drives hold its joint positions, the object has no weight, and a few control
-steps pass. It is rejected if it leaves the scene or still moves.
+steps pass. It is rejected if it leaves the scene or still moves. A candidate with the robot deep in the object is not
+tried: states between two frames may be deeper than these.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import torch
 
 from xreset.errors import DemoError
 from xreset.files.progress import Progress, unseen
+from xreset.geometry.collision import object_depth
 from xreset.physics import State
 from xreset.resets.bank import ResetBank, starts_and_goals
 from xreset.resets.closing import closing_states
@@ -22,6 +24,7 @@ from xreset.resets.config import ClosingConfig, FilterConfig, SqueezeConfig
 from xreset.resets.fingers import fingers_of, squeeze_targets
 from xreset.resets.probe import REASONS, probe, rejection
 from xreset.retarget.file import Retargeted
+from xreset.retarget.validity import Thresholds
 from xreset.spec import (
     ObjectSpec,
     RobotSpec,
@@ -58,7 +61,10 @@ def stable_states(
     object_name = retargeted.object_name[sequence]
     states = State.at_rest(*map(torch.as_tensor, poses))
     find = partial(_reasons, engines, scene, limits=limits, num_envs=num_envs, device=device)
-    reason = find(object_name, states, progress=progress)
+    depth = object_depth(robot, objects, object_name, *poses)
+    shallow = np.flatnonzero(depth <= Thresholds().object_depth)
+    reason = np.full(len(frame), REASONS.index("object collision"))
+    reason[shallow] = find(object_name[shallow], states[shallow], progress=progress)
     if squeeze.presses:
         rows = np.flatnonzero((reason < 0) & post_contact)
         touching = [values[rows] for values in poses]
@@ -67,7 +73,7 @@ def stable_states(
         states.joint_target[rows] = torch.as_tensor(targets, dtype=torch.float32)
         refused = rows[find(object_name[rows], states[rows]) >= 0]
         states.joint_target[refused] = states.joint_pos[refused]
-    work = len(engines) * len(frame)
+    work = len(engines) * len(shallow)
     progress(work, work)
 
     keep = reason < 0
@@ -89,6 +95,7 @@ def stable_states(
         object_pos=stable.object_pos.numpy(),
         object_quat_wxyz=stable.object_quat.numpy(),
         object_name=object_name[keep],
+        object_depth=depth[keep].astype(np.float32),
         rejected_reason=reason[~keep].astype(np.int32),
         reason_names=REASONS,
         **kept,

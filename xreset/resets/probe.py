@@ -24,8 +24,10 @@ REASONS = (
     "joint velocity",
     "not finite",
     "overflow",
+    "object collision",
 )
-"""Why a candidate is rejected. Where several reasons apply, the last one is stated."""
+"""Why a candidate is rejected. Where several reasons apply, the last one is stated. ``object collision``: the robot is
+deeper in the object than retargeting allows; such a candidate is not tried."""
 
 
 def probe(

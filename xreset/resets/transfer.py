@@ -2,8 +2,8 @@
 
 Where the retargeting of a demonstration fails, often at its goal, the bank has no state. Grasps of other demonstrations
 may hold the object there. Such a grasp, hand and object together, is moved to the pose, and the arm's inverse
-kinematics finds the arm's joints. The state is kept if the hand then holds the object at its full weight in every
-engine of the bank.
+kinematics finds the arm's joints. The state is kept if the robot is then no deeper in the object than retargeting
+allows, and the hand holds the object at its full weight in every engine of the bank.
 
 Shape letters: L states of the bank, J joints, W poses of demonstrations, M candidates (each a grasp at a pose).
 """
@@ -22,6 +22,7 @@ from xreset.errors import DemoError
 from xreset.files.checks import PositiveInt, frozen, obeys_rules
 from xreset.files.processes import batches
 from xreset.files.progress import unseen
+from xreset.geometry.collision import object_depth
 from xreset.geometry.rotations import matrix_to_quat, quat_angle
 from xreset.geometry.shapes import turn_of
 from xreset.physics import Backend, State
@@ -40,7 +41,8 @@ from xreset.spec import ObjectSpec, RobotSpec, SceneSpec, checked_objects, objec
 _RAISED = 0.03
 """Poses are those of frames in which the object is raised by more than this [m]."""
 _THRESHOLDS = Thresholds(wrist_position=0.005, wrist_orientation=float(np.radians(3.0)))
-"""How exactly the arm must carry the hand: a grasp holds as long as the hand keeps its place at the object."""
+"""How exactly the arm must carry the hand: a grasp holds as long as the hand keeps its place at the object. At these
+limits the hand may have come deep into the object."""
 _STEPS = 30
 """Control steps of 1/60 s for which the hand must hold the object: 99 % of the states that hold for so long hold for
 5 s."""
@@ -153,7 +155,9 @@ def add_transfers(
     held = np.concatenate(rows)[order]
     kept = _first_of_each(held, pose, config.per_pose)
     chosen = order[np.searchsorted(held, kept)]
-    return _joined(bank, State.cat(states)[torch.as_tensor(chosen)], poses, pose[kept])
+    added = State.cat(states)[torch.as_tensor(chosen)]
+    depth = _depth(robot, objects, bank.object_name[grasp[kept]], added)
+    return _joined(bank, added, poses, pose[kept], depth)
 
 
 def _holding(
@@ -170,8 +174,8 @@ def _holding(
     """Try grasps at poses; arguments as of :func:`add_transfers` and :func:`_carried`.
 
     Returns:
-        The states in which the arm reaches the grasp and the hand holds the object in every engine, and their
-        candidates, ascending.
+        The states in which the arm reaches the grasp, the robot is not deep in the object and the hand holds it in
+        every engine, and their candidates, ascending.
     """
     robot, scene = robot_and_scene
     count = len(grasp)
@@ -180,6 +184,8 @@ def _holding(
         bank, grasp, poses, pose, robot, lambda done: progress(done / count / steps)
     )
     held = np.flatnonzero(is_reached)
+    depth = _depth(robot, scene.objects, bank.object_name[grasp[held]], states[held])
+    held = held[depth <= _THRESHOLDS.object_depth]
     for number, engine in enumerate(bank.engines, start=1):
         if not len(held):
             break
@@ -305,6 +311,14 @@ def _carried(
     return State.at_rest(*map(torch.as_tensor, arrays)), is_reached
 
 
+def _depth(
+    robot: RobotSpec, objects: Sequence[ObjectSpec], object_name: np.ndarray, states: State
+) -> np.ndarray:
+    """[M] depth of the robot in the object of states [m]."""
+    poses = (states.joint_pos, states.object_pos, states.object_quat)
+    return object_depth(robot, objects, object_name, *(tensor.numpy() for tensor in poses))
+
+
 def _is_held(backend: Backend, start: State) -> Tensor:
     """[N] bool: whether the object of each world is where it was at the start."""
     state = backend.state()
@@ -321,8 +335,10 @@ def _first_of_each(rows: np.ndarray, group: np.ndarray, count: int) -> np.ndarra
     return rows[place < count]
 
 
-def _joined(bank: ResetBank, states: State, poses: _Poses, pose: np.ndarray) -> ResetBank:
-    """Return the bank with states [M] at poses [M] after its own."""
+def _joined(
+    bank: ResetBank, states: State, poses: _Poses, pose: np.ndarray, depth: np.ndarray
+) -> ResetBank:
+    """Return the bank with states [M] at poses [M] after its own; ``depth`` [M] is that of the robot in the object."""
     count = len(pose)
     sequence = poses.sequence[pose]
     added = {
@@ -341,5 +357,8 @@ def _joined(bank: ResetBank, states: State, poses: _Poses, pose: np.ndarray) -> 
     if bank.frame_part is not None:
         own["frame_part"] = bank.frame_part
         added["frame_part"] = np.zeros(count, dtype=np.float32)
+    if bank.object_depth is not None:
+        own["object_depth"] = bank.object_depth
+        added["object_depth"] = depth.astype(np.float32)
     joined = {name: np.concatenate((own[name], values)) for name, values in added.items()}
     return replace(bank, **joined)

@@ -56,6 +56,8 @@ def make_bank(
 ) -> ResetBank:
     """Test retargeted states in physics and keep the stable ones; then add states in grasps of other demonstrations.
 
+    A state in which the robot is more than 2 mm deep in the object is rejected without a test.
+
     Args:
         retargeted: motion made by xreset retarget.
         robot: name or folder of the robot; default: that of the motion.
@@ -80,6 +82,7 @@ def make_bank(
     Raises:
         DemoError: no frame is valid, or an object of a valid frame is unknown.
         FileFormatError: the motion is for a robot with other joints.
+        XResetError: coal, which retargeting needs too, is not installed.
     """
     from xreset.files.records import stated_doubts
     from xreset.resets.bank import write_bank

@@ -97,8 +97,8 @@ class Retargeted(ObjectMotions):
     """[F] mean distance between the points of the object that keypoints touch and the surfaces of the links that follow
     these [m]; infinite where none touches."""
     object_depth: FrameDistances | None = None
-    """[F] largest depth of the hand in the object's collision pieces [m], 0 outside them; infinite where not
-    annotated."""
+    """[F] depth of the robot in the object [m] (:func:`xreset.geometry.collision.object_depth`), 0 outside it; infinite
+    where not annotated."""
 
     @property
     def post_contact(self) -> np.ndarray:

@@ -18,15 +18,16 @@ from xreset.demos.examine import human_contacts
 from xreset.files.checks import Checked, frozen
 from xreset.files.processes import batches, in_processes
 from xreset.files.progress import Progress, unseen
+from xreset.geometry.collision import object_depth
 from xreset.geometry.fields import DistanceFields
-from xreset.geometry.rotations import matrix_to_quat, quat_to_matrix
+from xreset.geometry.rotations import matrix_to_quat
 from xreset.geometry.surface import prepared_surface
 from xreset.physics.tensors import one_thread
 from xreset.retarget.arm.config import ArmSearch
 from xreset.retarget.arm.model import ArmModel, ArmTargets
 from xreset.retarget.arm.solve import track_each
 from xreset.retarget.file import Retargeted
-from xreset.retarget.hand.clearance import Objects, contact_distance, object_depth
+from xreset.retarget.hand.clearance import contact_distance
 from xreset.retarget.hand.config import HandWeights
 from xreset.retarget.hand.model import HandModel, HandState, HandTargets
 from xreset.retarget.hand.solve import retarget_hand
@@ -89,8 +90,18 @@ def follow(
     wrist_error[~demos.hand_valid] = np.inf
 
     links = arm.kinematics.link_poses(torch.as_tensor(joint_pos), robot.tracked_links)
-    contact_error, object_depth = hands.measures(arm, joint_pos)
-    reason = too_deep(reason, object_depth, _THRESHOLDS)
+    contact_error = hands.contact_error(arm, joint_pos)
+    seen = demos.hand_valid
+    depth = np.full(demos.num_frames, np.inf)
+    depth[seen] = object_depth(
+        robot,
+        objects,
+        demos.object_name[demos.sequence_of_frame[seen]],
+        joint_pos[seen],
+        demos.object_pos[seen],
+        demos.object_quat_wxyz[seen],
+    )
+    reason = too_deep(reason, depth, _THRESHOLDS)
     contact = np.asarray(hands.touching.any(axis=1))
     goal_pos, goal_quat = demos.goal_pose
     return Retargeted(
@@ -120,7 +131,7 @@ def follow(
         hand_error=hand_error,
         wrist_error=wrist_error,
         contact_error=contact_error,
-        object_depth=object_depth,
+        object_depth=depth,
     )
 
 
@@ -202,25 +213,15 @@ class HandMotions:
             progress(done, len(todo))
 
     @one_thread()
-    def measures(self, arm: ArmModel, joint_pos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Measure a robot with this hand along all frames of the demonstrations.
-
-        Args:
-            arm: the robot.
-            joint_pos: [F, J] its joints.
-
-        Returns:
-            Mean distance between the points that keypoints touch and the surfaces of the links that follow them [F],
-            infinite where none touches; largest depth of the hand in the object [F], infinite where no hand is
-            annotated [m].
-        """
-        contact_error, depth = np.full((2, len(joint_pos)), np.inf)
+    def contact_error(self, arm: ArmModel, joint_pos: np.ndarray) -> np.ndarray:
+        """[F] mean distance between the points that keypoints touch and the surfaces of the links that follow them [m],
+        infinite where none touches, for a robot with this hand and its joints [F, J]."""
+        error = np.full(len(joint_pos), np.inf)
         model = self.model
-        index = torch.as_tensor(self._object_index[self.demos.sequence_of_frame])
-        seen = np.flatnonzero(self.demos.hand_valid)
-        fields = self._fields.to(model.device)
-        for first in range(0, len(seen), _FRAMES_AT_ONCE):
-            rows = seen[first : first + _FRAMES_AT_ONCE]
+        some = self.touching[:, model.keypoint_indices].any(axis=1)
+        touching = np.flatnonzero(some & self.demos.hand_valid)
+        for first in range(0, len(touching), _FRAMES_AT_ONCE):
+            rows = touching[first : first + _FRAMES_AT_ONCE]
             joints = torch.as_tensor(joint_pos[rows])
             root = arm.kinematics.link_poses(joints, [model.robot.hand_root])[:, 0]
             state = HandState(
@@ -228,22 +229,11 @@ class HandMotions:
                 root_pos=root[:, :3, 3],
                 root_quat=matrix_to_quat(root[:, :3, :3]),
             ).to(model.device)
-            objects = Objects(
-                pos=torch.as_tensor(self.demos.object_pos[rows]).to(model.device),
-                rot=quat_to_matrix(torch.as_tensor(self.demos.object_quat_wxyz[rows])).to(
-                    model.device
-                ),
-                object_index=index[rows].to(model.device),
-                fields=fields,
-            )
-            bodies = model.bodies(state)
-            depth[rows] = object_depth(model, bodies, objects).cpu().numpy()
-            touching = self.touching[rows][:, model.keypoint_indices]
             touched = torch.as_tensor(self._contact_points[rows][:, model.keypoint_indices])
-            gap = contact_distance(model, bodies, touched.to(model.device)).cpu().numpy()
-            some = touching.any(axis=1)
-            contact_error[rows[some]] = gap[some].mean(axis=1, where=touching[some])
-        return contact_error, depth
+            gap = contact_distance(model, model.bodies(state), touched.to(model.device))
+            where = self.touching[rows][:, model.keypoint_indices]
+            error[rows] = gap.cpu().numpy().mean(axis=1, where=where)
+        return error
 
     def _targets(
         self, sequences: np.ndarray, rows: np.ndarray, is_frame: np.ndarray

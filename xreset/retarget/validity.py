@@ -47,7 +47,7 @@ class Thresholds:
     self_depth: float = 0.003
     """Depth of the robot's shapes in one another [m]."""
     object_depth: float = 0.002
-    """Depth of the hand in the object [m]. Physics pushes them apart, with a jump of the object."""
+    """Depth of the robot in the object [m]. Physics pushes them apart, with a jump of the object."""
 
 
 @frozen
@@ -97,7 +97,7 @@ def too_deep(reason: np.ndarray, object_depth: np.ndarray, thresholds: Threshold
 
     Args:
         reason: [F] index into :data:`REASONS`.
-        object_depth: [F] largest depth of the hand in the object [m]; infinite where it is not known.
+        object_depth: [F] depth of the robot in the object [m]; infinite where it is not known.
         thresholds: limits of a valid frame.
 
     Returns:

@@ -89,14 +89,6 @@ def too_near(
     return together[order[together.frame[order].argsort(stable=True)]]
 
 
-def object_depth(model: HandModel, bodies: Bodies, objects: Objects) -> Tensor:
-    """[B] largest depth of the hand's balls in the object [m], 0 outside it; arguments as of :func:`too_near`."""
-    every = torch.ones(len(bodies.pos), dtype=torch.bool, device=bodies.pos.device)
-    depth = bodies.pos.new_zeros(len(every))
-    found = _at_object(model, bodies, objects, every, 0.0)
-    return depth.scatter_reduce(0, found.frame, -found.value, "amax")
-
-
 def contact_distance(model: HandModel, bodies: Bodies, points: Tensor) -> Tensor:
     """Return the distances between the hand and points that its keypoints should touch.
 

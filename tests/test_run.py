@@ -5,17 +5,18 @@ from unittest.mock import patch
 
 import xreset
 from tests.command import refused
-from tests.data import InFolder
+from tests.toy_results import InFolder
 from xreset.cli import perform
 from xreset.cli import run as command
 from xreset.demos.archive import write_demos
 from xreset.demos.verbs import synthesize
 from xreset.errors import FileFormatError, RunError
+from xreset.files.storage import file_hash
 from xreset.retarget.file import read_retargeted, write_retargeted
 
 
 class Run(InFolder, TestCase):
-    def run_it(self, demos="soup.npz", robot="ur7e-sharpa"):
+    def run_it(self, demos="soup.npz", robot="ur7e-sharpa", **options):
         """Run with real motion and bank; return the verbs of all steps."""
         verbs = []
 
@@ -27,7 +28,7 @@ class Run(InFolder, TestCase):
                 perform(words)
 
         with patch.object(command, "perform", step):
-            xreset.run(f"{self.folder}/{demos}", robot=robot, out=f"{self.folder}/v0.1")
+            xreset.run(f"{self.folder}/{demos}", robot=robot, out=f"{self.folder}/v0.1", **options)
         return verbs
 
     def test_steps_that_are_done_are_left_out(self):
@@ -35,6 +36,11 @@ class Run(InFolder, TestCase):
             write_demos(self.folder / name, synthesize(["soup"], 1, fps=5, seed=seed))
         self.assertEqual(self.run_it(), ["retarget", "resets", "train", "eval", "report"])
         self.assertEqual(self.run_it(), ["train", "eval", "report"])
+        self.write_run("v0.1", resets=f"{self.folder}/v0.1/resets.npz")
+        demos = {"demos": file_hash(self.folder / "soup.npz")}
+        self.write_results("v0.1", inputs=demos, seed=3, episode_seconds=5.0)
+        options = {"seed": 3, "episodes": 2, "engine": "mujoco"}
+        self.assertEqual(self.run_it(**options), ["train", "report"])
         (self.folder / "v0.1/resets.npz").unlink()
         self.assertEqual(self.run_it(), ["resets", "train", "eval", "report"])
         with self.assertRaisesRegex(RunError, "another archive of demonstrations"):

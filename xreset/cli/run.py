@@ -116,7 +116,12 @@ def run(
     missing = []
     for name in engines:
         result = out / "eval" / f"{name}.json"
-        if not steps.is_evaluated(result, files, seed=seed, episodes=episodes):
+        seconds = None
+        if result.is_file():
+            seconds = read_run(out).config.task.termination.episode_seconds
+        if not steps.is_evaluated(
+            result, files, seed=seed, episodes=episodes, seconds=seconds, trained=seconds
+        ):
             missing.append(name)
     if missing:
         _step("eval", out, demos=demos, episodes=episodes, seed=seed, meshes=meshes, engine=missing)

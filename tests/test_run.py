@@ -35,7 +35,7 @@ class Run(InFolder, TestCase):
         for name, seed in (("soup.npz", 0), ("other.npz", 1)):
             write_demos(self.folder / name, synthesize(["soup"], 1, fps=5, seed=seed))
         self.assertEqual(self.run_it(), ["retarget", "resets", "train", "eval", "report"])
-        self.assertEqual(self.run_it(), ["train", "eval", "report"])
+        self.assertEqual(self.run_it(iterations=7), ["train", "eval", "report"])
         self.write_run("v0.1", resets=f"{self.folder}/v0.1/resets.npz")
         demos = {"demos": file_hash(self.folder / "soup.npz")}
         self.write_results("v0.1", inputs=demos, seed=3, episode_seconds=5.0)

@@ -137,9 +137,10 @@ def _show_times(
     steps = {
         "retarget": frames * _RETARGET / 60 / cores,
         "resets": frames * _RESETS / 60 / min(cores, 2),
-        "train": minutes,
-        "eval": played * _EPISODE / 60 / cores,
     }
+    if minutes is not None:
+        steps["train"] = minutes
+    steps["eval"] = played * _EPISODE / 60 / cores
     times = ", ".join(f"{name} {max(value, 0.1):.2g}" for name, value in steps.items())
     console.print(
         f"{sequences} demonstrations, {frames} frames, {cores} cores; engines: {', '.join(engines)}. "

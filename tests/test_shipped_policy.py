@@ -20,10 +20,12 @@ from xreset.runtime import Controller
 LARGEST = 5e6
 LARGEST_GRAPH = 2e5
 """What a policy may add to every download [bytes]."""
-EASY = "005_tomato_soup_can"
-"""An object that jaws can take, too."""
-FLOOR = 0.45
-"""Mean task progress of the two episodes below. One in which the object is only touched makes 0.33."""
+FLOOR = 0.6
+"""Mean task progress of the episodes below; an object that is grasped and lifted makes 0.66."""
+EASIER = {"openarm": "005_tomato_soup_can"}
+"""Objects of these episodes where the policy's first one, a cracker box, is too wide for its jaw."""
+DRIFT = {"openarm": 3e-5}
+"""Largest difference of targets that add up in half a second [rad, m], where rounding makes more than 1e-5."""
 
 ABSENT = "rsl_rl,onnx,onnxscript,tensorboard,warp,mujoco_warp,mujoco,pybullet,sapien,coal,viser"
 ACT = """
@@ -88,7 +90,9 @@ class ShippedPolicyTest(unittest.TestCase):
         played, episodes = compared(name, spec.objects_of(None)[:1], 0.5, graph)
         steps = round(0.5 / spec.task.control_dt)
         self.assertEqual((len(episodes), len(played.differences)), (1, steps))
-        self.assertLess(np.max(played.differences), 3e-5)
+        same, alone = np.max(played.differences, axis=0)
+        self.assertLess(same, 1e-5)
+        self.assertLess(alone, DRIFT.get(name, 1e-5))
 
     @unittest.skipUnless(find_spec("mujoco"), "mujoco is not installed")
     @unittest.skipUnless(find_spec("onnxscript"), "onnxscript is not installed")
@@ -100,8 +104,8 @@ class ShippedPolicyTest(unittest.TestCase):
     def test_it_still_grasps_and_lifts(self):
         for name, file in shipped().items():
             with self.subTest(name):
-                self.assertIn(EASY, OnnxPolicy(file).contract.objects)
-                demos = synthesize([EASY], 2)
+                first = OnnxPolicy(file).contract.objects[0]
+                demos = synthesize([EASIER.get(name, first)], 2)
                 with tempfile.TemporaryDirectory() as folder:
                     options = {"num_envs": 2, "episodes": 1, "episode_seconds": 3.0}
                     (result,) = evaluate(name, demos, out=folder, **options)

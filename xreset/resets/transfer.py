@@ -126,6 +126,7 @@ def add_transfers(
     place = np.arange(len(pose)) - np.searchsorted(pose, pose)
     rows = [np.zeros(0, dtype=int)]
     states = []
+    depths = []
     at_once = 2 * config.per_pose
     work = len(pose) * (1 + len(bank.engines))
     for first in range(0, _CANDIDATES, at_once):
@@ -136,7 +137,7 @@ def add_transfers(
             break
         before = work * float(np.mean(place < first))
         share = work * float(np.mean(is_next))
-        holding, held = _holding(
+        holding, held, depth = _holding(
             bank,
             grasp[tried],
             poses,
@@ -148,6 +149,7 @@ def add_transfers(
         )
         rows.append(tried[held])
         states.append(holding)
+        depths.append(depth)
     progress(work, work)
     if not states:
         return replace(bank, transferred=np.zeros(bank.num_states, dtype=bool))
@@ -156,8 +158,7 @@ def add_transfers(
     kept = _first_of_each(held, pose, config.per_pose)
     chosen = order[np.searchsorted(held, kept)]
     added = State.cat(states)[torch.as_tensor(chosen)]
-    depth = _depth(robot, objects, bank.object_name[grasp[kept]], added)
-    return _joined(bank, added, poses, pose[kept], depth)
+    return _joined(bank, added, poses, pose[kept], np.concatenate(depths)[chosen])
 
 
 def _holding(
@@ -170,12 +171,12 @@ def _holding(
     num_envs: int,
     device: str,
     progress: Callable[[float], None],
-) -> tuple[State, np.ndarray]:
+) -> tuple[State, np.ndarray, np.ndarray]:
     """Try grasps at poses; arguments as of :func:`add_transfers` and :func:`_carried`.
 
     Returns:
         The states in which the arm reaches the grasp, the robot is not deep in the object and the hand holds it in
-        every engine, and their candidates, ascending.
+        every engine; their candidates, ascending; and how deep the robot is in the object [m].
     """
     robot, scene = robot_and_scene
     count = len(grasp)
@@ -184,8 +185,9 @@ def _holding(
         bank, grasp, poses, pose, robot, lambda done: progress(done / count / steps)
     )
     held = np.flatnonzero(is_reached)
-    depth = _depth(robot, scene.objects, bank.object_name[grasp[held]], states[held])
-    held = held[depth <= _THRESHOLDS.object_depth]
+    depth = np.full(count, np.inf)
+    depth[held] = _depth(robot, scene.objects, bank.object_name[grasp[held]], states[held])
+    held = np.flatnonzero(depth <= _THRESHOLDS.object_depth)
     for number, engine in enumerate(bank.engines, start=1):
         if not len(held):
             break
@@ -204,7 +206,7 @@ def _holding(
             ),
         )
         held = held[holds]
-    return states[torch.as_tensor(held)], held
+    return states[torch.as_tensor(held)], held, depth[held]
 
 
 def _grasps(bank: ResetBank, retargeted: Retargeted, robot: RobotSpec) -> np.ndarray:

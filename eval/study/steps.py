@@ -267,7 +267,7 @@ def eval_todo(run: Run, folder: Path, spec: Evaluation, subset: Subset, engines:
             files,
             seed=spec.seed,
             episodes=spec.episodes,
-            seconds=spec.episode_seconds or trained,
+            seconds=spec.episode_seconds,
             trained=trained,
         ):
             missing.append(engine)
@@ -282,7 +282,7 @@ def is_evaluated(
     seed: int,
     episodes: int,
     seconds: float | None = None,
-    trained: float | None = None,
+    trained: float,
 ) -> bool:
     """Return whether an engine's results are those of certain episodes and files.
 
@@ -292,14 +292,14 @@ def is_evaluated(
         seed: seed of the starts.
         episodes: episodes of each demonstration.
         seconds: length of an episode [s]; None: as in the policy's training.
-        trained: length of an episode in the policy's training [s], for results that do not state a length.
+        trained: length of an episode in the policy's training [s]; results may not state theirs.
     """
     if not result.is_file():
         return False
     found = read_result(result)
     hashes = {name: file_hash(file) for name, file in files.items() if file.is_file()}
     played = (found.seed, found.episodes_per_demo, found.episode_seconds or trained)
-    is_same = played == (seed, episodes, seconds)
+    is_same = played == (seed, episodes, seconds or trained)
     return is_same and hashes.items() <= found.inputs.items()
 
 

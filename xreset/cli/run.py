@@ -83,8 +83,8 @@ def run(
     engines = [each.name for each in quick_engines(named, "cpu")]
     # what the last steps would refuse, after minutes of work
     backend_class(ENGINE).engine_version()
-    share = starting_config(recipe).task.reset.object_share
-    shared_worlds(archive.object_names, num_envs, share)
+    task = starting_config(recipe).task
+    shared_worlds(archive.object_names, num_envs, task.reset.object_share)
     if minutes is None and iterations is None:
         minutes = _MINUTES
     _show_times(len(archive.sequence_name), archive.num_frames, minutes, episodes, engines)
@@ -113,15 +113,11 @@ def run(
         seed=seed,
     )
     files = {"demos": demos, "policy": out / "policy.onnx"}
+    trained = task.termination.episode_seconds
     missing = []
     for name in engines:
         result = out / "eval" / f"{name}.json"
-        seconds = None
-        if result.is_file():
-            seconds = read_run(out).config.task.termination.episode_seconds
-        if not steps.is_evaluated(
-            result, files, seed=seed, episodes=episodes, seconds=seconds, trained=seconds
-        ):
+        if not steps.is_evaluated(result, files, seed=seed, episodes=episodes, trained=trained):
             missing.append(name)
     if missing:
         _step("eval", out, demos=demos, episodes=episodes, seed=seed, meshes=meshes, engine=missing)

@@ -32,7 +32,6 @@ from xreset.resets.distribution import Reset, ResetDistribution
 from xreset.resets.goals import GoalSet
 from xreset.resets.inputs import Data, load_inputs
 from xreset.resets.schedule import schedule
-from xreset.resets.settle import settle_starts
 from xreset.retarget.file import Retargeted
 from xreset.spec import ObjectSpec, RobotSpec, SceneSpec
 from xreset.task.config import TaskConfig, evaluation_task, with_episodes_of
@@ -128,7 +127,7 @@ class Trial:
     meshes: Path | None = None
     """Folder of the object meshes; None: the stand-ins."""
     inputs: dict[str, str] = field(default_factory=dict)
-    """SHA-256 of the policy and of the demos, or resets for a bank; and ``starts: settled`` if objects came to rest."""
+    """SHA-256 of the policy and of the demos, or resets for a bank."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -155,7 +154,6 @@ def load_trial(
     meshes: str | Path | None = None,
     seed: int = 0,
     num_envs: int = 64,
-    settle: bool = False,
     episode_seconds: float | None = None,
 ) -> Trial:
     """Load what a policy is to play. For the baseline ``ik``, demonstrations are retargeted here.
@@ -167,8 +165,6 @@ def load_trial(
         meshes: folder of object meshes; default: the folder of the policy's training.
         seed: seed of the perturbations.
         num_envs: worlds that run at the same time.
-        settle: whether objects come to rest before episodes begin (:mod:`xreset.resets.settle`), in MuJoCo for every
-            engine, so that all engines play the same starts. Default: the recorded poses, as in the paper.
         episode_seconds: length of an episode [s]; default: as in the policy's training.
 
     Raises:
@@ -187,9 +183,6 @@ def load_trial(
         hashes["resets" if is_bank else "demos"] = inputs.hash
     bank = inputs.bank
     used = [o for o in inputs.objects if o.name in bank.sequence_object]
-    if settle:
-        bank, _ = settle_starts(bank, policy.robot, used, num_envs=num_envs)
-        hashes["starts"] = "settled"
     if isinstance(inputs.data, GoalSet):
         task = replace(task, reset=replace(task.reset, spawn_xy=0.0, spawn_yaw=0.0))
     return Trial(

@@ -48,7 +48,6 @@ def evaluate(
     engines: Annotated[str | Engine | Sequence[str | Engine], Option("engine")] = "mujoco",
     *,
     episodes: PositiveInt = 5,
-    settle: bool = False,
     episode_seconds: float | None = None,
     robot: str | Path | None = None,
     meshes: str | Path | None = None,
@@ -69,8 +68,6 @@ def evaluate(
             or a goal set (xreset goals).
         engines: physics engine to play in; several are played from the same starts.
         episodes: episodes of each demonstration, each with another perturbation of robot and object.
-        settle: let objects come to rest before episodes begin. Default: the recorded poses, as in the paper, from which
-            one object in eleven turns by more than 10 degrees.
         episode_seconds: length of an episode [s], such as 12, as in the published paper; default: as in the policy's
             training.
         robot: name or folder of the robot; default: the policy's own. Baselines need it.
@@ -103,7 +100,6 @@ def evaluate(
         meshes=meshes,
         seed=seed,
         num_envs=num_envs,
-        settle=settle,
         episode_seconds=episode_seconds,
     )
     folder = Path(out) if out else spec.folder

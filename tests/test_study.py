@@ -96,11 +96,12 @@ class FileTest(Studied):
             ("retarget", "--picture /tmp/victim.png", False),
             ("retarget", "--device cpu --out=/tmp/victim.npz", False),
             ("retarget", "-h", False),
-            ("resets", "--settle --out /tmp/victim.npz", False),
+            ("resets", "--device cpu --out /tmp/victim.npz", False),
             ("resets", "--robot /tmp", False),
             ("retarget", "--device cpu", True),
             ("resets", "--closing.spacing 0.005 --num-envs 8 --engine mujoco", True),
-            ("resets", "--settle", True),
+            ("resets", "--squeeze.force 5", True),
+            ("resets", "--settle", False),
         ):
             options = text.split()
             file = self.file(f"{HEAD}{DATA}{command} = {json.dumps(options)}\n{RUN}[runs.a]\n")
@@ -115,11 +116,13 @@ class FileTest(Studied):
     def test_defaults_hold_the_options_of_resets_of_all_data(self):
         default = ("--squeeze.force", "5")
         text = RUN.replace("[defaults]", f"[defaults]\nresets = {json.dumps(default)}")
-        other = f"[data.own]\nresets = ['--settle']\n[data.plain]\nresets = []\n{text}[runs.a]\n"
+        other = (
+            f"[data.own]\nresets = ['--num-envs=8']\n[data.plain]\nresets = []\n{text}[runs.a]\n"
+        )
         found = read_study(self.file(HEAD + DATA + other)).data
         self.assertEqual(
             {name: data.resets for name, data in found.items()},
-            {"toy": default, "own": ("--settle",), "plain": ()},
+            {"toy": default, "own": ("--num-envs=8",), "plain": ()},
         )
         for entry, words in (
             ("data = 3", "defaults, data and runs must be tables"),

@@ -93,7 +93,6 @@ class Data(Checked):
             "--filter.",
             "--squeeze.",
             "--transfer.",
-            "--settle",
             "--engine",
             "--backend",
             "--device",

@@ -50,7 +50,6 @@ def make_bank(
     closing: ClosingConfig | None = ClosingConfig(),
     squeeze: SqueezeConfig | None = SqueezeConfig(),
     transfer: TransferConfig | None = TransferConfig(),
-    settle: bool = False,
     progress: Callable[[str, float, int], None] = unseen,
     note: Callable[[str], None] = _warn,
 ) -> ResetBank:
@@ -74,8 +73,6 @@ def make_bank(
             with the targets that press; one that an engine rejects then does not press.
         transfer: extra states at poses of each demonstration, in grasps of other demonstrations of the same object
             that hold its full weight in every engine. There are none if no finger presses.
-        settle: let objects come to rest (in the first engine) before episodes begin at home. Default: the recorded
-            poses, as in the paper, from which one object in eleven turns by more than 10 degrees.
         progress: called with (what is tried, candidates tried, candidates in all).
         note: called with the doubts that the motion states about its demonstrations.
 
@@ -88,7 +85,6 @@ def make_bank(
     from xreset.resets.bank import write_bank
     from xreset.resets.filter import stable_states
     from xreset.resets.inputs import load_inputs
-    from xreset.resets.settle import settle_starts
     from xreset.resets.transfer import add_transfers
 
     inputs = load_inputs(
@@ -126,17 +122,6 @@ def make_bank(
             device=device,
             progress=partial(progress, "grasps of other demonstrations"),
         )
-    if settle:
-        bank, at_rest = settle_starts(
-            bank,
-            *scene,
-            engines[0],
-            num_envs=num_envs,
-            device=device,
-            progress=partial(progress, "start poses come to rest"),
-        )
-        if moving := int((~at_rest).sum()):
-            note(f"{moving} of {len(at_rest)} objects do not come to rest and start as recorded")
     if out is not None:
         made_with = {
             "engines": list(engines),
@@ -145,7 +130,6 @@ def make_bank(
             "closing": asdict(closing),
             "squeeze": asdict(squeeze),
             "transfer": asdict(transfer),
-            "settle": settle,
             "meshes": str(inputs.meshes) if inputs.meshes else None,
             "doubts": doubts,
         }

@@ -22,7 +22,7 @@ from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.shapes import quat_of, turn_of
 from xreset.resets.closing import closing_states, positions_between, rotations_between
 from xreset.resets.distribution import ResetDistribution, bank_starts
-from xreset.resets.fingers import Fingers, _balance, fingers_of, squeeze_targets
+from xreset.resets.fingers import Fingers, _balance, fingers_of, grip_forces, squeeze_targets
 from xreset.retarget.file import write_retargeted
 from xreset.task.config import ResetConfig
 
@@ -179,23 +179,18 @@ class FingersTest(TestCase):
         # the jaw's inner side
         assert_allclose(fingers.point[:, 0, 0], -0.005, atol=1e-3)
 
-    def test_a_squeeze_by_weight_equals_one_with_that_force(self):
-        fingers, joints = self.fingers(0.0201)
+    def test_a_grip_has_the_force_and_the_weight_of_the_object(self):
+        fingers, _ = self.fingers(0.0201, 0.0501)
         weight = 9.81 * toy_grasp.brick().mass
-        by_force = squeeze_targets(
-            ROBOT, fingers, joints, SqueezeConfig(force=1.0 + 2 * weight, weight=0.0)
-        )
-        by_weight = squeeze_targets(ROBOT, fingers, joints, SqueezeConfig(force=1.0, weight=2.0))
-        assert_allclose(by_weight, by_force, atol=1e-9)
-        self.assertTrue(SqueezeConfig(weight=1.0).presses)
+        forces = grip_forces(fingers, 1.0)
+        assert_allclose(forces.sum(dim=1), [2 * (1.0 + weight), 0.0], rtol=1e-3)
+        assert_allclose(forces[0], [1.0 + weight, 1.0 + weight, 0.0], rtol=0.1)
 
     def test_two_fingertips_press_harder(self):
-        fingers, joints = self.fingers(0.0201)
-        by_default = squeeze_targets(ROBOT, fingers, joints, SqueezeConfig())
-        stated = squeeze_targets(ROBOT, fingers, joints, SqueezeConfig(force=20.0))
-        assert_array_equal(by_default, stated)
-        self.assertEqual([SqueezeConfig().for_hand(n).force for n in (2, 3, 5)], [20.0, 5.0, 5.0])
-        self.assertEqual(SqueezeConfig(force=1.0).for_hand(2).force, 1.0)
+        self.assertEqual([SqueezeConfig().newtons(n) for n in (2, 3, 5)], [20.0, 5.0, 5.0])
+        self.assertEqual(SqueezeConfig(force=1.0).newtons(2), 1.0)
+        self.assertTrue(SqueezeConfig().presses)
+        self.assertFalse(SqueezeConfig(force=0.0).presses)
 
     def test_levers_lead_from_the_centre_of_mass_to_the_finger(self):
         fingers, joints = self.fingers(0.0201)
@@ -227,9 +222,8 @@ class FingersTest(TestCase):
         fingers, joints = self.fingers(0.0201, 0.0501)
 
         def squeezed(force, robot=ROBOT):
-            return squeeze_targets(
-                robot, fingers, joints, SqueezeConfig(force=force, weight=0.0, balanced=False)
-            )
+            pressing = fingers.leading & (fingers.gap < 0.005)
+            return squeeze_targets(robot, fingers, joints, force * pressing)
 
         for force in (1.0, 2.5):
             target = squeezed(force)
@@ -276,10 +270,7 @@ class TargetsTest(TestCase):
         assert_close(chosen.joint_target, chosen.joint_pos + 0.25)
 
 
-PLAIN = (
-    *("--closing.spacing", "None", "--squeeze.force", "0", "--squeeze.weight", "0"),
-    *("--squeeze.no-balanced", "--transfer.per-pose", "0"),
-)
+PLAIN = ("--closing.spacing", "None", "--squeeze.force", "0", "--transfer.per-pose", "0")
 """Options for a bank of frames that do not press."""
 
 

@@ -148,13 +148,14 @@ class FilterTest(TestCase):
             limits["progress"](len(object_name))
             return np.array(verdicts[len(tries) - 1])
 
-        def pressed(robot, fingers, joint_pos, config):
+        def pressed(robot, fingers, joint_pos, force):
             return joint_pos + 0.25
 
         motion = self.retargeted(first_contact=np.array([2, 1]))
         with (
             mock.patch("xreset.resets.filter.probe", probe),
             mock.patch("xreset.resets.filter.fingers_of"),
+            mock.patch("xreset.resets.filter.grip_forces"),
             mock.patch("xreset.resets.filter.squeeze_targets", pressed),
         ):
             return make_bank(motion, self.robot, self.objects, **ONLY_FRAMES | options), tries
@@ -164,7 +165,7 @@ class FilterTest(TestCase):
         bank, tries = self.tried(
             [[-1] * 5, [-1, -1, 0]],
             limits=FilterConfig(steps=3),
-            squeeze=SqueezeConfig(force=1.0, weight=0.0),
+            squeeze=SqueezeConfig(force=1.0),
         )
         (names, plain, steps), (pressing_names, pressing, pressing_steps) = tries
         self.assertEqual(names, [SOUP] * 3 + [SPAM] * 2)

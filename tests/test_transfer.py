@@ -350,7 +350,7 @@ class BankTest(InFolder):
     def test_a_robot_is_not_judged_by_them(self):
         with in_this_process():
             found, plain = (
-                judge(each, ROBOT, OBJECTS, squeeze=SqueezeConfig(force=4.0, reach=0.01))
+                judge(each, ROBOT, OBJECTS, squeeze=SqueezeConfig(force=4.0))
                 for each in (self.found, self.bank)
             )
         self.assertEqual([row.tried for row in found.rows], [row.tried for row in plain.rows])
@@ -379,7 +379,7 @@ class CommandTest(InFolder):
         return read_bank(path), config, out
 
     def test_everything_at_once(self):
-        press = ("--closing.spacing", "None", "--squeeze.force", "2.5", "--squeeze.weight", "0")
+        press = ("--closing.spacing", "None", "--squeeze.force", "2.5")
         plain, config, out = self.resets(*press, "--transfer.per-pose", "0")
         self.assertNotIn("grasps of other", out)
         self.enterContext(patch("xreset.resets.transfer._POSES", 2))
@@ -402,7 +402,7 @@ class CommandTest(InFolder):
             ROBOT,
             OBJECTS,
             closing=None,
-            squeeze=SqueezeConfig(force=2.5, weight=0.0),
+            squeeze=SqueezeConfig(force=2.5),
             transfer=TransferConfig(per_pose=1),
         )
         assert_array_equal(again.joint_pos, bank.joint_pos)
@@ -411,8 +411,7 @@ class CommandTest(InFolder):
         bank, config, _ = self.resets()
         self.assertEqual(config["closing"], {"spacing": 0.005})
         # the force for two fingertips; 5 N for more
-        pressing = {"force": 20.0, "weight": 1.0, "balanced": True, "reach": 0.005}
-        self.assertEqual(config["squeeze"], pressing)
+        self.assertEqual(config["squeeze"], {"force": 20.0})
         transfer = {"per_pose": 8}
         self.assertEqual(config["transfer"], transfer)
         again = make_bank(read_retargeted(self.motion), ROBOT, OBJECTS)

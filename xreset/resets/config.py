@@ -4,8 +4,6 @@ The defaults are those of the headline results (docs/results.md)."""
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 from xreset.files.checks import (
     Checked,
     Length,
@@ -45,32 +43,20 @@ class SqueezeConfig(Checked):
 
     force: NonNegativeFloat | None = None
     """Normal force of each finger that presses [N]; None: 5, or 20 for a hand with two fingertips, whose two contacts
-    alone carry the object's weight and its torque about the line between them. If this and ``weight`` are 0, targets
-    are the joints' positions."""
-    weight: NonNegativeFloat = 1.0
-    """Further force, as a share of the object's weight. With one force for all objects, heavy ones slip and light ones
-    tilt."""
-    balanced: bool = True
-    """Whether the forces on an object nearly cancel: the thumb presses as hard as all fingers that oppose it together.
-    The mean force stays the same."""
-    reach: PositiveFloat = 0.005
-    """A finger presses if it is nearer than this to the object [m]."""
+    alone carry the object's weight and its torque about the line between them. 0: no finger presses, and targets are
+    the joints' positions."""
 
     @property
     def presses(self) -> bool:
         """Whether there is any force."""
-        return self.force is None or self.force > 0 or self.weight > 0
+        return self.force != 0
 
-    def for_hand(self, fingertips: int) -> SqueezeConfig:
-        """Return the configuration with the force for a hand with this number of fingertips."""
+    def newtons(self, fingertips: int) -> float:
+        """Return the force for a hand with this number of fingertips [N]."""
         if self.force is not None:
-            return self
+            return self.force
         # With 5 N and the weight 55 % of the Robotiq's lifted states hold the object for a second, with 20 N 98 %.
-        return replace(self, force=20.0 if fingertips == 2 else 5.0)
-
-
-JUDGE_SQUEEZE = SqueezeConfig(weight=0.0, balanced=False, reach=0.01)
-"""How fingers press when a robot is judged (``xreset robots judge``): with the same force on every object."""
+        return 20.0 if fingertips == 2 else 5.0
 
 
 @frozen

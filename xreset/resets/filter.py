@@ -21,7 +21,7 @@ from xreset.physics import State
 from xreset.resets.bank import ResetBank, starts_and_goals
 from xreset.resets.closing import closing_states
 from xreset.resets.config import ClosingConfig, FilterConfig, SqueezeConfig
-from xreset.resets.fingers import fingers_of, squeeze_targets
+from xreset.resets.fingers import fingers_of, grip_forces, squeeze_targets
 from xreset.resets.probe import REASONS, probe, rejection
 from xreset.retarget.file import Retargeted
 from xreset.retarget.validity import Thresholds
@@ -69,7 +69,8 @@ def stable_states(
         rows = np.flatnonzero((reason < 0) & post_contact)
         touching = [values[rows] for values in poses]
         fingers = fingers_of(robot, scene.objects, object_name[rows], *touching)
-        targets = squeeze_targets(robot, fingers, touching[0], squeeze)
+        forces = grip_forces(fingers, squeeze.newtons(len(robot.fingertips)))
+        targets = squeeze_targets(robot, fingers, touching[0], forces)
         states.joint_target[rows] = torch.as_tensor(targets, dtype=torch.float32)
         refused = rows[find(object_name[rows], states[rows]) >= 0]
         states.joint_target[refused] = states.joint_pos[refused]

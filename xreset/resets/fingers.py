@@ -19,7 +19,6 @@ from xreset.geometry.fields import DistanceFields
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import matvec, quat_rotate, quat_rotate_inverse
 from xreset.geometry.surface import prepared_surface
-from xreset.resets.config import SqueezeConfig
 from xreset.resets.programs import pressing_targets
 from xreset.spec import GRAVITY, ObjectSpec, RobotSpec
 
@@ -125,8 +124,22 @@ def fingers_of(
     )
 
 
+_REACH = 0.005
+"""A finger presses if it is nearer than this to the object [m]."""
+
+
+def grip_forces(fingers: Fingers, force: float) -> Tensor:
+    """Return the normal forces [M, G] with which links hold their object: ``force`` [N] and the object's weight for
+    each finger, in balance.
+
+    With one force for all objects, heavy ones slip and light ones tilt.
+    """
+    pressing = fingers.leading & (fingers.gap < _REACH)
+    return (force + fingers.weight[:, None]) * pressing * _balance(fingers, pressing)
+
+
 def squeeze_targets(
-    robot: RobotSpec, fingers: Fingers, joint_pos: np.ndarray, config: SqueezeConfig
+    robot: RobotSpec, fingers: Fingers, joint_pos: np.ndarray, force: Tensor
 ) -> np.ndarray:
     """Return drive targets [M, J] with which the fingers press, within joint limits and the drives' largest torques.
 
@@ -139,18 +152,11 @@ def squeeze_targets(
         robot: robot of the states.
         fingers: how near its fingers are to the objects.
         joint_pos: [M, J]
-        config: which fingers press, and how hard.
+        force: [M, G] normal force of each link [N].
     """
-    config = config.for_hand(len(robot.fingertips))
     q = torch.as_tensor(joint_pos, dtype=torch.float64)
     kinematics = Kinematics(robot)
     jacobian = kinematics.jacobian(q, fingers.links, fingers.point).linear
-    pressing = fingers.leading & (fingers.gap < config.reach)
-    force = (config.force or 0.0) * pressing
-    if config.weight:
-        force = force + config.weight * fingers.weight[:, None] * pressing
-    if config.balanced:
-        force = force * _balance(fingers, pressing)
     torque = torch.einsum("mgi,mgij->mj", force[..., None] * fingers.inward, jacobian)
     effort = torch.as_tensor(drive_values(robot, "effort"))
     return pressing_targets(kinematics, q, torque.clamp(-effort, effort)).numpy()

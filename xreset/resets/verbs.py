@@ -69,8 +69,9 @@ def make_bank(
         device: where engines run that can use a GPU: cpu or cuda; the others run on the CPU.
         limits: duration of the test, and the largest speeds of a stable state.
         closing: extra states between frames in which the hand closes in on the object.
-        squeeze: how hard fingers press in states after contact, and which fingers. Accepted states are tried once more
-            with the targets that press; one that an engine rejects then does not press.
+        squeeze: how hard fingers within 5 mm of the object press in states after contact, in addition to the object's
+            weight. The thumb presses as hard as all fingers that oppose it together. Accepted states are tried once
+            more with the targets that press; one that an engine rejects then does not press.
         transfer: extra states at poses of each demonstration, in grasps of other demonstrations of the same object
             that hold its full weight in every engine. There are none if no finger presses.
         progress: called with (what is tried, candidates tried, candidates in all).
@@ -98,8 +99,8 @@ def make_bank(
     engines = (engine,) if isinstance(engine, str) else tuple(dict.fromkeys(engine))
     limits = limits or FilterConfig()
     closing = closing or ClosingConfig(spacing=None)
-    squeeze = squeeze or SqueezeConfig(force=0.0, weight=0.0)
-    squeeze = squeeze.for_hand(len(inputs.robot.fingertips))
+    squeeze = squeeze or SqueezeConfig(force=0.0)
+    squeeze = SqueezeConfig(force=squeeze.newtons(len(inputs.robot.fingertips)))
     transfer = transfer or TransferConfig(per_pose=0)
     bank = stable_states(
         motion,

@@ -52,6 +52,8 @@ DISTANCE = 0.03
 """Largest change of the object's position in the palm's frame [m]."""
 ANGLE = np.pi / 4
 """Largest change of the object's orientation in the palm's frame [rad]."""
+_REACH = 0.010
+"""A finger presses if it is nearer than this to the object [m]."""
 _CLOSE_STEPS = 15
 """Control steps without weight."""
 _MOVE_STEPS = 45
@@ -231,20 +233,20 @@ def _grasps(
         lifted.object_pos,
         lifted.object_quat_wxyz,
     )
-    chosen = _tightest(fingers, lifted, states, squeeze.reach)
+    chosen = _tightest(fingers, lifted, states)
     if not chosen:
         raise RobotError(
             f"robot {robot.name!r}: in no lifted state are the thumb and another finger within "
-            f"{1e3 * squeeze.reach:g} mm of the object. Check the fingertips' frames (xreset robots check --picture), "
-            "or raise squeeze.reach."
+            f"{1e3 * _REACH:g} mm of the object. Check the fingertips' frames (xreset robots check --picture)."
         )
-    targets = squeeze_targets(robot, fingers, lifted.joint_pos, squeeze)[chosen]
+    force = squeeze.newtons(len(robot.fingertips)) * (fingers.leading & (fingers.gap < _REACH))
+    targets = squeeze_targets(robot, fingers, lifted.joint_pos, force)[chosen]
     tried = lifted.with_states(np.array(chosen))
     arrays = (tried.joint_pos, tried.object_pos, tried.object_quat_wxyz, targets)
     return tried, State.at_rest(*map(torch.as_tensor, arrays))
 
 
-def _tightest(fingers: Fingers, bank: ResetBank, count: int, reach: float) -> list[int]:
+def _tightest(fingers: Fingers, bank: ResetBank, count: int) -> list[int]:
     """Return the rows of the ``count`` tightest grasps of each object, taken from its sequences in turn."""
     thumb = fingers.gap[:, fingers.finger == 0].amin(dim=-1)
     other = fingers.gap[:, fingers.finger != 0].amin(dim=-1)
@@ -255,7 +257,7 @@ def _tightest(fingers: Fingers, bank: ResetBank, count: int, reach: float) -> li
         rank[mine[np.argsort(gap[mine], kind="stable")]] = np.arange(len(mine))
     chosen = []
     for name in np.unique(bank.object_name):
-        mine = np.flatnonzero((bank.object_name == name) & (gap < reach))
+        mine = np.flatnonzero((bank.object_name == name) & (gap < _REACH))
         chosen += mine[np.lexsort((gap[mine], rank[mine]))][:count].tolist()
     return sorted(chosen)
 

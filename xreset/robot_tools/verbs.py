@@ -14,7 +14,7 @@ from xreset.files.checks import Option, Output, Png, PositiveInt, obeys_rules
 from xreset.files.progress import unseen
 from xreset.files.storage import this_command
 from xreset.physics.plugins import Device
-from xreset.resets.config import JUDGE_SQUEEZE, SqueezeConfig
+from xreset.resets.config import SqueezeConfig
 from xreset.robot_tools.placement import Finalist, PlaceConfig, write_placement
 
 if TYPE_CHECKING:
@@ -166,7 +166,7 @@ def judge(
     *,
     meshes: str | Path | None = None,
     states: PositiveInt = 8,
-    squeeze: SqueezeConfig = JUDGE_SQUEEZE,
+    squeeze: SqueezeConfig = SqueezeConfig(),
     num_envs: PositiveInt = 32,
     device: Device = "cpu",
     picture: Png | None = None,
@@ -191,7 +191,7 @@ def judge(
         states: number of states of each object: those in the air in which the thumb and another finger are nearest to
             the object, as many from each demonstration as possible. States in grasps of other demonstrations are left
             out: they were chosen because they hold.
-        squeeze: how hard fingers press, and which fingers.
+        squeeze: how hard fingers press that are within 10 mm of the object, the same on every object.
         num_envs: worlds at a time.
         device: where engines run that can use a GPU: cpu or cuda; the others run on the CPU.
         picture: PNG to write: the best state of each object at the start and after each phase.

@@ -131,6 +131,11 @@ class Wrong(InFolder):
         raised = demos.object_pos.copy()
         raised[:, 2] += rest_height(obj, tilted[0]) - raised[0, 2]
         offset = demos.hand_keypoints + np.float32([0.0, 0.025, 0.0])
+        fall = np.linspace(0.0, 0.6, len(lost))[:, None] * np.float32([0.0, 0.0, -1.0])
+        below = {
+            "object_pos": demos.object_pos + fall,
+            "hand_keypoints": demos.hand_keypoints + fall[:, None],
+        }
         for words, wrong, changed in (
             (
                 "does not change at all for 0.3 s or longer, and then jumps",
@@ -149,6 +154,7 @@ class Wrong(InFolder):
                 {"object_pos": raised, "object_quat_wxyz": tilted},
             ),
             ("with the hand shifted by", False, {"hand_keypoints": offset}),
+            ("The object is .* cm inside the table later. The table's frame", True, below),
         ):
             with self.subTest(words):
                 found = examine(replace(demos, **changed), known)
@@ -161,6 +167,7 @@ class Wrong(InFolder):
         tenth = {"object_pos": demos.object_pos / 10}
         for words, changed in (
             ("comes no nearer", still),
+            ("m later, but the table's top is at z = 0", below),
             ("be played backwards", backwards),
             ("their numbers are a tenth of what they should be", tenth),
         ):

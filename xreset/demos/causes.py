@@ -30,6 +30,8 @@ _SUNK = -0.030
 """An object that starts below this cannot be on the table [m]."""
 _BELOW = 0.04
 """An object that gets this much deeper into the table than at the start does not move on it [m]."""
+_BURIED = -0.08
+"""An object whose lowest vertex gets below this in any frame cannot be above the table [m]: -0.024 in DexYCB."""
 _LOOKS = 24
 """Frames of a recording in which the height of the object is looked at."""
 _STACKED = 0.20
@@ -137,7 +139,9 @@ class Recording:
 
     @cached_property
     def least_height(self) -> float:
-        """Height of the object's lowest vertex in any of some frames [m]."""
+        """The same in any of some frames [m]."""
+        if self.surface is None:
+            return float(self.pos[:, 2].min())
         frames = np.linspace(0, len(self.pos) - 1, _LOOKS).astype(int)
         return min(self._lowest(frame) for frame in np.unique(frames).tolist())
 
@@ -260,10 +264,15 @@ def _in_frame(pos: np.ndarray, matrix: np.ndarray, points: np.ndarray) -> np.nda
 def _of_start(r: Recording) -> Iterator[Contradiction]:
     """Yield contradictions between the object's start and the table."""
     height = r.start_height
+    low = r.least_height
     if r.surface is None:
         if not _ORIGIN[0] <= height <= _ORIGIN[1]:
             yield Contradiction(
                 f"the object starts at z = {height:.3f} m, but the table's top is at z = 0", True
+            )
+        elif low < _ORIGIN[0]:
+            yield Contradiction(
+                f"the object is at z = {low:.3f} m later, but the table's top is at z = 0", True
             )
     elif height < -_SETTLED:
         yield Contradiction(
@@ -273,10 +282,14 @@ def _of_start(r: Recording) -> Iterator[Contradiction]:
         yield Contradiction(
             f"the object starts {length_text(height)} above the table", height > _STACKED
         )
-    if r.surface is not None and (low := r.least_height) < min(height, 0.0) - _BELOW:
-        yield Contradiction(f"it is {length_text(low)} inside the table later", False)
+    if r.surface is not None and low < min(height, 0.0) - _BELOW:
+        yield Contradiction(
+            f"the object is {length_text(low)} inside the table later", low < _BURIED
+        )
     if r.off_table > 0:
-        yield Contradiction(f"it starts {length_text(r.off_table)} beside the table's top", True)
+        yield Contradiction(
+            f"the object starts {length_text(r.off_table)} beside the table's top", True
+        )
 
 
 def _of_hand(r: Recording) -> Iterator[Contradiction]:
@@ -588,6 +601,11 @@ def _advice(r: Recording) -> str:
         return (
             "Are hand and object in the same frame and unit, recorded at the same times, and is the mesh the one that"
             " was tracked?"
+        )
+    if r.off_table == 0 and r.start_height >= -_SETTLED and r.least_height < -_SETTLED:
+        return (
+            "The table's frame may be tilted, or the tracker may have lost the object: remove the frames in which it"
+            " is inside the table."
         )
     if r.off_table > 0 or r.surface is None:
         return (

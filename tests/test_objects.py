@@ -328,6 +328,19 @@ class MeshImport(InFolder):
             self.assertRaisesRegex(ObjectError, words, add_mesh, path, out, name, scale=scale)
         self.assertEqual(sorted(p.name for p in out.iterdir()), ["brick.obj", "brick.toml"])
 
+    def test_a_mesh_of_another_unit_is_told_by_its_density(self):
+        for name, size, words in (
+            (
+                "006_mustard_bottle",
+                (1.0, 0.6, 1.9),
+                "0.603 kg are 0.529 kg/m.3; expected .* Is the",
+            ),
+            ("006_mustard_bottle", (0.01, 0.006, 0.019), "0.603 kg are 5.29e.05 kg/m.3"),
+            ("crate", (0.6, 0.6, 0.6), "108 kg are 500 kg/m.3; expected 0.0001 to 50 kg"),
+        ):
+            path = self.write(trimesh.creation.box(size))
+            self.assertRaisesRegex(ObjectError, words, import_with_notes, path, name)
+
     def test_a_killed_command_can_be_repeated(self):
         path = self.write(BOX)
         out = self.folder / "objects"
@@ -550,7 +563,9 @@ class ThinWalls(InFolder):
     def test_limits_of_pieces_and_effort(self):
         few = decompose(RING, Settings(max_pieces=3))
         self.assertLessEqual(len(few.shapes), 3)
-        short = decompose(RING, Settings(effort=5_000))
+        with self.assertLogs("xreset.objects.decompose", "WARNING") as log:
+            short = decompose(RING, Settings(effort=5_000))
+        self.assertRegex(*log.output, "takes up to a minute")
         self.assertEqual((few.finished, short.finished), (True, False))
         crossing = trimesh.creation.box((0.1, 0.08, 0.06))  # few triangles, and many pieces to join
         crossing.vertices[0, 0] = 0.5

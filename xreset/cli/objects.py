@@ -55,7 +55,7 @@ def _cells(obj: ObjectSpec) -> tuple[str, ...]:
         obj.name,
         ycb.ALIAS_OF.get(obj.name, ""),
         f"{obj.mass:.3g}",
-        "x".join(f"{1000 * length:.0f}" for length in high - low),
+        "x".join(f"{1000 * size:.{1 if size < 0.01 else 0}f}" for size in high - low),
         f"{len(obj.pieces)} {' + '.join(sorted(kinds))}",
     )
 

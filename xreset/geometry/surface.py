@@ -28,6 +28,8 @@ _GRID_SPACING = 0.004
 """Spacing of the grid of signed distances [m]."""
 _GRID_MARGIN = 0.032
 """Width of the grid around the object's bounding box [m]."""
+_NODES_AT_ONCE = 100_000
+"""Nodes that are compared with the planes of a piece at once: 0.1 GB with 124 planes."""
 _NODE_SHIFT = 1e-7 * np.sqrt([2.0, 3.0, 5.0])
 """Shift of the nodes in the test for inside, so that no node lies exactly in a face [m]."""
 
@@ -184,6 +186,8 @@ def _nodes_inside(pieces: Sequence[Shape], nodes: np.ndarray) -> np.ndarray:
     for piece in pieces:
         low, high = shape_mesh(piece).bounds
         in_box = np.flatnonzero(((shifted >= low) & (shifted <= high)).all(axis=1))
-        heights = plane_heights(shifted[in_box], half_spaces(piece))
-        inside[in_box[(heights <= 0).all(axis=1)]] = True
+        planes = half_spaces(piece)
+        for some in np.array_split(in_box, len(in_box) // _NODES_AT_ONCE + 1):
+            heights = plane_heights(shifted[some], planes)
+            inside[some[(heights <= 0).all(axis=1)]] = True
     return inside.reshape(nodes.shape[:3])

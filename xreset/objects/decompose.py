@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import heapq
 import itertools
+import logging
 from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -36,6 +37,8 @@ if TYPE_CHECKING:
     import trimesh
     from manifold3d import Manifold
 
+_log = logging.getLogger(__name__)
+
 _CUTS = 7
 """Planes that are tried along each direction, evenly spaced."""
 _CROSSES = ((0, 1), (0, 2), (1, 2), (3, 4), (3, 5), (4, 5))
@@ -56,6 +59,8 @@ _FACES = 3000
 """Meshes that are not closed are reduced to about this many triangles before they are made solids."""
 _QUICK = 0.85
 """Share of the tolerance that the quick measure may find."""
+_LONG = 0.95
+"""Share of the effort that is left when the user learns that cutting takes long."""
 _FEW = 0.625
 """Share of the allowed number that pieces are joined to; the others are for the pieces that deviate most then."""
 _EXACT = 1e-4
@@ -425,7 +430,10 @@ class _Cutter:
         return [_shape(piece) for *_, piece in cut], max(-excess for excess, *_ in cut)
 
     def _spend(self, *solids: Manifold) -> None:
+        before = self.effort
         self.effort -= sum(solid.num_tri() for solid in solids)
+        if self.effort < _LONG * self._settings.effort <= before:
+            _log.warning("the mesh is cut into convex pieces, which takes up to a minute")
 
     def _cut_worst(
         self,

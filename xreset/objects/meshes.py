@@ -20,8 +20,8 @@ from xreset.files.text import shown
 from xreset.geometry.shapes import load_mesh, mesh_arrays, shell_properties
 from xreset.objects.cache import cached_pieces
 from xreset.objects.decompose import WALL, Pieces, Settings, openings
-from xreset.objects.properties import Properties, properties_of
-from xreset.objects.ycb import MASSES
+from xreset.objects.properties import DENSITIES, MASSES, Properties, properties_of
+from xreset.objects.ycb import MASSES as PUBLISHED_MASSES
 from xreset.spec import ObjectSpec
 
 if TYPE_CHECKING:
@@ -121,6 +121,8 @@ def import_with_notes(path: str | Path, name: str) -> Import:
     if not mesh.is_volume:
         notes.append(_how_closed(mesh, pieces))
     mass, mass_source = _mass(path, name, own, pieces.volume, notes)
+    if mesh.is_volume:
+        _check_density(path, mesh, mass)
     com = pieces.com
     inertia = pieces.inertia * mass
     if own.density is None and mesh.is_volume and mass / pieces.volume < _HOLLOW:
@@ -162,14 +164,26 @@ def _mass(
         return own.mass, "stated"
     density = own.density
     if density is None:
-        if name in MASSES:
-            return MASSES[name], "published (YCB)"
+        if name in PUBLISHED_MASSES:
+            return PUBLISHED_MASSES[name], "published (YCB)"
         density = DEFAULT_DENSITY
         notes.append(
             f"its mass is unknown: {density * volume:.3g} kg is assumed, by a density of"
             f" {density:.0f} kg/m^3. State `mass` in {path.with_suffix('.toml').name}"
         )
     return density * volume, f"{density:g} kg/m^3"
+
+
+def _check_density(path: Path, mesh: trimesh.Trimesh, mass: float) -> None:
+    """Refuse, with ``ObjectError``, a closed mesh of another unit or a mass that no object of its size has."""
+    density = mass / mesh.volume
+    if MASSES[0] <= mass <= MASSES[1] and DENSITIES[0] <= density <= DENSITIES[1]:
+        return
+    raise ObjectError(
+        f"{path} measures {_size(mesh)}, so {mass:.3g} kg are {density:.3g} kg/m^3; expected {MASSES[0]:g} to"
+        f" {MASSES[1]:g} kg, and {DENSITIES[0]:g} to {DENSITIES[1]:g} kg/m^3. Is the mesh in metres? If not: xreset"
+        " objects import MESH --scale."
+    )
 
 
 def _how_closed(mesh: trimesh.Trimesh, pieces: Pieces) -> str:
@@ -268,8 +282,8 @@ def _checked(mesh: trimesh.Trimesh, path: Path) -> trimesh.Trimesh:
     # before merging, which rounds by the size
     if mesh.extents is not None and not _SIZES[0] <= mesh.extents.max() <= _SIZES[1]:
         raise ObjectError(
-            f"{path} measures {_size(mesh)}, expected {_SIZES[0]:g} to {_SIZES[1]:g} m. State the file's unit with "
-            "--scale: 1 for metres, 0.001 for millimetres."
+            f"{path} measures {_size(mesh)}, expected {_SIZES[0]:g} to {_SIZES[1]:g} m. Import the file with its unit:"
+            " xreset objects import MESH --scale 0.001 for millimetres."
         )
     mesh.merge_vertices(merge_tex=True, merge_norm=True)  # texture seams are no holes
     mesh.update_faces(mesh.nondegenerate_faces())

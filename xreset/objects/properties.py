@@ -10,6 +10,11 @@ from xreset.errors import ObjectError, WrongValueError
 from xreset.files.checks import Checked, Rule, from_dict, frozen
 from xreset.files.storage import read_toml
 
+MASSES = (1e-4, 50.0)
+"""Least and largest mass of an object [kg]."""
+DENSITIES = (2.0, 25_000.0)
+"""Least and largest density of an object [kg/m^3]: an empty balloon is above, osmium with 22,600 below."""
+
 
 def _within(low: float, high: float) -> Rule:
     return Rule(f"a number from {low:g} to {high:g}", lambda value: low <= value <= high)
@@ -19,10 +24,10 @@ def _within(low: float, high: float) -> Rule:
 class Properties(Checked):
     """None: unknown."""
 
-    mass: Annotated[float, _within(1e-4, 50.0)] | None = None
+    mass: Annotated[float, _within(*MASSES)] | None = None
     """[kg]"""
-    density: Annotated[float, _within(1.0, 25_000.0)] | None = None
-    """[kg/m^3], of the mesh's volume; osmium has 22,600."""
+    density: Annotated[float, _within(*DENSITIES)] | None = None
+    """[kg/m^3], of the mesh's volume."""
     friction: Annotated[float, _within(0.05, 3.0)] | None = None
     """Coefficient of its material; see :attr:`xreset.spec.ObjectSpec.friction`."""
     tolerance: Annotated[float, _within(5e-4, 0.1)] | None = None

@@ -59,7 +59,7 @@ def commands(folder: Path) -> list[Command]:
     eyes = folder / "eyes"
     studies = folder / "studies"
     where = ["--engine", "mujoco", "--device", "cpu", "--num-envs", 4]
-    resume = ["train", "--out", run, "--resume"]
+    resume = ["train", "--out", run]
     robot = ["--arm", "tests/robots/arm.urdf", "--hand", "tests/robots/hand.xml"]
     watch = [
         "--out",
@@ -102,7 +102,7 @@ def commands(folder: Path) -> list[Command]:
             run / "checkpoints",
         ),
         Command(
-            "train --resume",
+            "train, to continue",
             [*resume, "--iterations", 120],
             run / "policy.onnx",
             run / "checkpoints",

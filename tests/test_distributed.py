@@ -34,7 +34,7 @@ class TwoProcesses(WithBank):
         cls.out = cls.folder / "run"
         new = f"--robot openarm --resets {cls.bank} --engine mujoco --device cpu --num-envs 8 --seed 3"
         first = f"--out {cls.out} --iterations 2 {new} {SMALL}"
-        second = f"--out {cls.out} --iterations 40 --resume"
+        second = f"--out {cls.out} --iterations 40"
         command = [sys.executable, "tests/train_worker.py", str(cls.folder), first, second]
         environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
         done = subprocess.run(

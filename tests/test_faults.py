@@ -74,7 +74,7 @@ class Run(WithEnv, InFolder):
         plan = {step: ("broken" if step % 2 else "overflow", step % N) for step in range(9, 17)}
         self.assertGreater(len(plan), MAX_FAULTY_SHARE * FAULT_WINDOW * 8 * N)
         with self.assertRaisesRegex(
-            RunError, "4 worlds were not finite and 4 dropped contacts.*--resume"
+            RunError, "4 worlds were not finite and 4 dropped contacts.*xreset train --out"
         ):
             self.train(folder / "many", plan)
         self.assertEqual([c.name for c in checkpoints(folder / "many")], ["000001.pt"])

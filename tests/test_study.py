@@ -436,7 +436,7 @@ class WholeTest(InOneFolder):
         (command,) = step.todo()[1]
         self.assertEqual(
             command[len(XRESET) :],
-            ["train", "--out", f"{self.out}/x-reset-seed0", "--iterations", "4", "--resume"],
+            ["train", "--out", f"{self.out}/x-reset-seed0", "--iterations", "4"],
         )
 
     def test_another_configuration_under_the_same_name_is_refused(self):

@@ -299,9 +299,7 @@ class TrainingTest(WithBank):
             ({"weights": self.out}, "hash of the weights is None there"),
             ({"config": slower}, "ppo.learning_rate is .* there and 1e-05 here"),
         ):
-            message = (
-                f"job-again holds another training: {problem}.*Choose another folder, or .*--resume"
-            )
+            message = f"job-again holds another training: {problem}.*Choose another folder, or .*xreset train --out"
             with refuses(self, message, RunError, problem):
                 again(**changes)
         self.assertEqual(len(checkpoints(out)), 2)
@@ -467,34 +465,36 @@ class TrainingTest(WithBank):
                 parsed(*arguments)
             self.assertRegex(said.getvalue(), problem)
 
-    def test_a_run_is_resumed_as_it_was_started(self):
-        """Options that it was started with may be repeated, others are not ignored."""
-        other = self.folder / "other.npz"
-        write_bank(other, toy_bank(self.robot).with_states(np.arange(6) < 3))
+    def test_without_data_a_run_continues_as_it_was_started(self):
+        """Its length may change; other options are not ignored."""
         for options, problem in (
             ("", ""),
-            (
-                f"--robot openarm --engine mujoco --device cpu --num-envs 4 --seed 3 --resets {self.bank}",
-                "",
-            ),
-            (
-                "--num-envs 8",
-                "num_envs is '8', but .* was started with 4, and .* Omit num_envs, or start",
-            ),
-            ("--seed 5", "seed is '5', but"),
-            ("--seed=0", "seed is '0', but .* was started with 3"),
-            ("--num_envs 4096", "num_envs is '4096', but .* was started with 4"),
+            ("--iterations 2 --minutes 1", ""),
+            ("--num-envs 8", "continues as it was started. Omit num_envs, give the whole command"),
+            ("--seed=0", "Omit seed"),
             ("--recipe paper", "Omit recipe"),
             (f"--weights {self.out}", "Omit weights"),
-            ("--config.ppo.horizon 16", "Omit config, or start another run"),
-            ("--engine pybullet", "engine is 'pybullet', but .* was started with mujoco"),
-            ("--robot ur7e-sharpa", "robot is 'ur7e-sharpa', but .* was started with openarm"),
-            (f"--resets {other}", "resets is .*other.npz', but .* was started with .*bank.npz"),
-            (f"--meshes {self.folder}", "meshes is .*, but .* was started with None"),
-            (f"--resets {self.bank} --goals {other}", "goals is .*other.npz', but .* was started"),
+            ("--config.ppo.horizon 16", "Omit config, .* or start another run"),
+            ("--engine mujoco", "Omit engine"),
+            ("--robot openarm", "Omit robot"),
+            (f"--meshes {self.folder}", "Omit meshes"),
         ):
             with self.subTest(options):
-                self.assert_resumed(f"train --resume --out {self.out} {options}", problem)
+                self.assert_resumed(f"train --out {self.out} {options}", problem)
+        nothing = self.folder / "nothing"
+        words = "needs a reset bank .*, a goal set .*, or both; .*nothing holds no run to continue"
+        self.assert_resumed(f"train --out {nothing} --seed 0", words)
+        self.assertFalse(nothing.exists())
+
+    def test_the_flag_that_continued_a_run_is_not_needed(self):
+        words = "--resume is gone: a training continues with --out RUN alone"
+        with (
+            patch("xreset.learning.train.resume") as resumed,
+            redirect_stderr(io.StringIO()) as said,
+        ):
+            main(["train", "--resume", "--out", str(self.out), "--iterations", "3"])
+        self.assertIn(words, said.getvalue())
+        resumed.assert_called_once_with(self.out, own=None, iterations=3, minutes=None, wandb=None)
 
     def test_a_number_of_iterations_that_has_passed_does_not_shorten_a_run(self):
         """The policy is exported where that is missing."""
@@ -530,7 +530,7 @@ class TrainingTest(WithBank):
             f"--recipe {stranger} --robot openarm --resets {self.bank} --engine mujoco --device cpu "
             f"--num-envs 4 --iterations 1 --out {self.folder}"
         )
-        resume = f"--resume --out {stranger} --iterations 3"
+        resume = f"--out {stranger} --iterations 3"
         naming = "--config.task.reward.terms.strangers_term:zero.weight=1.0"
 
         def said(arguments):
@@ -548,10 +548,8 @@ class TrainingTest(WithBank):
             with patch.object(TrainingRunner, "_agreed", return_value=True), quickly() as stopped:
                 main(["train", *f"{arguments} {naming}".split()])
             out = arguments.partition("--out ")[2].split()[0]
-            self.assertIn(
-                f"To continue: xreset train --out {out} --resume {naming}", stopped.getvalue()
-            )
-            said(f"--resume --out {out} {naming}")
+            self.assertIn(f"To continue: xreset train --out {out} {naming}", stopped.getvalue())
+            said(f"--out {out} {naming}")
         self.assertIn("strangers_term", sys.modules)
         self.assertEqual(read_run(f"{self.folder}/with").config.task.reward.own, own)
         self.assertEqual(len(checkpoints(stranger)), 3)
@@ -759,7 +757,7 @@ class TrainingTest(WithBank):
         self.assertTrue(torch.distributed.is_initialized())
 
     def test_a_run_without_a_checkpoint_starts_again(self):
-        """Killed before the first one: whether the same command is given again or --resume, and whatever is left of the first."""
+        """Killed before the first one: whether the same command is given again or only its folder, and whatever is left of the first."""
         for is_resumed in (True, False):
             with self.subTest(is_resumed=is_resumed):
                 name = f"early-{is_resumed}"

@@ -220,7 +220,7 @@ def train_todo(run: Run) -> Todo:
         return "", []
     length = {"out": run.folder, "iterations": iterations, "minutes": spec.minutes}
     if checkpoints(run.folder):
-        return left, [_xreset("train", **length, resume=True)]
+        return left, [_xreset("train", **length)]
     command = _xreset(
         "train",
         **length,

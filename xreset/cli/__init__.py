@@ -109,6 +109,10 @@ _GONE = {
     "select": "evaluate checkpoints, xreset eval RUN/checkpoints/NUMBER.pt, and compare them with xreset report",
 }
 """Command of earlier versions -> what to do in place of it."""
+_NEEDLESS = {
+    "--resume": "a training continues with --out RUN alone, or with its whole command",
+}
+"""Flag of earlier versions -> why it is not needed."""
 _NAME_OBJECTS = (["demos", "synth"], ["demos", "select"])
 """Commands whose ``--objects`` are names of objects, and always were."""
 
@@ -139,7 +143,10 @@ def _with_present_flags(argv: list[str]) -> list[str]:
             used[flag] = changed[flag]
         if flag.startswith("--vision."):
             changed[flag] = f"--config.task.{flag[2:]}"
-        words.append(changed.get(flag, flag) + equals + value)
+        if flag in _NEEDLESS:
+            print(f"xreset: {flag} is gone: {_NEEDLESS[flag]}.", file=sys.stderr)
+        else:
+            words.append(changed.get(flag, flag) + equals + value)
     for earlier, flag in used.items():
         print(
             f"xreset: {earlier} is now {flag}. The next release removes {earlier}.", file=sys.stderr

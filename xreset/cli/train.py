@@ -26,15 +26,15 @@ def command_for(arguments: list[str]) -> Callable[..., None]:
     Flags of terms are taken from the arguments.
     """
     parser = ArgumentParser(add_help=False, allow_abbrev=False)
-    for flag in ("--recipe", "--weights", "--goals", "--teacher"):
+    for flag in ("--recipe", "--weights", "--resets", "--goals", "--teacher"):
         parser.add_argument(flag, nargs="?")  # tyro reports a missing value
     parser.add_argument("--camera", action="append")
-    parser.add_argument("--resume", action="store_true")
     parser.add_argument(_HELP_CONFIG, nargs="?", const="")
     given = parser.parse_known_args(arguments)[0]
     recipe = given.recipe
     changes = any(word.startswith("--config.") for word in arguments)
-    if given.resume:
+    continues = not given.resets and not given.goals
+    if continues and given.help_config is None:
         config = TrainConfig()
     elif given.teacher and not recipe and not given.weights:
         from xreset.learning.train import config_of_student
@@ -55,7 +55,7 @@ def command_for(arguments: list[str]) -> Callable[..., None]:
 
     def prepare(options: dict[str, Any]) -> None:
         """Leave out what the configuration holds already, and a configuration that nobody gave."""
-        if given.resume:
+        if continues:
             options["config"] = options["config"] if changes else None
         else:
             options["cameras"] = ()

@@ -177,7 +177,7 @@ def own_terms_flags(own: Mapping[str, Mapping[str, Any]]) -> str:
 
 def resume_command(folder: Path, own: Mapping[str, Mapping[str, Any]]) -> str:
     """Return the command that continues a run, with the reward terms of the user's own."""
-    words = f"xreset train --out {shlex.quote(str(folder))} --resume"
+    words = f"xreset train --out {shlex.quote(str(folder))}"
     return f"{words} {own_terms_flags(own)}" if own else words
 
 

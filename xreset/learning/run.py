@@ -161,7 +161,7 @@ def latest_checkpoint(folder: Path) -> Path:
     found = checkpoints(folder)
     if not found:
         raise RunError(
-            f"{folder} has no checkpoint yet. Give a run folder, or train it: xreset train --out {folder} --resume"
+            f"{folder} has no checkpoint yet. Give a run folder, or train it: xreset train --out {folder}"
         )
     return found[-1]
 

@@ -74,64 +74,27 @@ def hash_of(data: ResetBank | GoalSet) -> str:
         return file_hash(write_data(Path(folder), data))
 
 
-def refuse_changes(
-    out: Path,
-    started: Mapping[str, Any],
-    new: Mapping[str, Any],
-    config: TrainConfig | None,
-    bank: str | Path | ResetBank | None,
-    goals: str | Path | GoalSet | None,
-    others: Sequence[str | Path] = (),
-) -> None:
-    """Refuse to resume a run with other options than it was started with.
+def refuse_options(out: Path, given: Mapping[str, Any], config: TrainConfig | None) -> None:
+    """Refuse, with ``RunError``, to continue without data where there is no run, or with other options than it was
+    started with: of the configuration, only the user's own reward terms may be named.
 
     Args:
         out: the run's folder.
-        started: values by name of what the run states too; None: not given.
-        new: values by name of what only a new run can have.
-        config: configuration, of which only the user's own reward terms may differ from the default or the run's.
-        bank: reset bank.
-        goals: goal set.
-        others: reset banks of other robots.
-
-    Raises:
-        RunError: an option differs; the message names the first.
+        given: values of further options by name; None: not given.
+        config: configuration.
     """
-    info = read_run(out)
-    another = f"start another run with this run's networks: --weights {out} --recipe {out}"
-    if config is not None:
-        rest = _without_own(config)
-        only_own = rest == TrainConfig() and config.task.reward.own
-        if not only_own and rest != _without_own(info.config):
-            new = {**new, "config": config}
-    for name, value in new.items():
+    if not (out / "run.json").is_file():
+        raise RunError(
+            f"A training needs a reset bank (--resets), a goal set (--goals), or both; {out} holds no run to continue."
+        )
+    only_own = config and config.task.reward.own and _without_own(config) == TrainConfig()
+    if not only_own:
+        given = {**given, "config": config}
+    for name, value in given.items():
         if value is not None:
             raise RunError(
-                f"--resume continues with the run's own networks and configuration. Omit {name}, or {another}"
-            )
-    given: dict[str, tuple[Any, Any]] = {}
-    for name, value in started.items():
-        given[name] = (value, getattr(info, name))
-    expected_others = [other.resets_hash for other in info.others]
-    if bank is not None and list(map(file_hash, others)) != expected_others:
-        raise RunError(
-            f"{out} was started with {1 + len(info.others)} reset banks, which are not these {1 + len(others)}. "
-            f"Omit resets, or {another}"
-        )
-    # A run with both a bank and a goal set has joined them in a file of its own with another hash.
-    is_joined = Path(info.resets).resolve().parent == out.resolve()
-    if not (is_joined and bank is not None and goals is not None):
-        for name, data in (("resets", bank), ("goals", goals)):
-            if data is None:
-                continue
-            found = file_hash(data) if isinstance(data, str | Path) else hash_of(data)
-            given[name] = (data, data if found == info.resets_hash else info.resets)
-    for name, (value, found) in given.items():
-        # compares folders by their absolute path, and names and numbers by their text
-        if value is not None and Path(str(value)).resolve() != Path(str(found)).resolve():
-            raise RunError(
-                f"{name} is {shown(str(value))}, but {out} was started with {found}, and --resume continues it as it "
-                f"was. Omit {name}, or {another}"
+                f"Without a reset bank or a goal set, {out} continues as it was started. Omit {name}, give the whole "
+                f"command again, or start another run with this run's networks: --weights {out} --recipe {out}"
             )
 
 
@@ -150,7 +113,7 @@ def refuse_another_training(
         if now.get(name) != value:
             raise RunError(
                 f"{out} holds another training: {name} is {shown(value)} there and {shown(now.get(name))} here. Choose "
-                "another folder, or continue it as it was started (xreset.resume or --resume)."
+                f"another folder, or continue it as it was started: xreset train --out {out}"
             )
 
 
@@ -268,11 +231,7 @@ def bank_or_goals(
         bank = bank if isinstance(bank, ResetBank) else read_bank(bank)
         bank = with_goals(bank, goals if isinstance(goals, GoalSet) else read_goals(goals))
     given = goals if bank is None else bank
-    if given is None:
-        raise RunError(
-            "A training needs a reset bank (--resets), a goal set (--goals), or both. To continue the run in the "
-            "folder, add --resume (resume=True)."
-        )
+    assert given is not None, "one of them is given"
     return given
 
 
@@ -308,7 +267,7 @@ def checkpoint_to_start_from(run: Path, robots: Sequence[RobotSpec], config: Tra
     if other.teacher is not None:
         raise RunError(
             f"{run} is the run of a student (--teacher) and has no critic, so no training can start from it. Give "
-            f"another run (--weights), or continue the student: --out {run} --resume"
+            f"another run (--weights), or continue the student: xreset train --out {run}"
         )
     start = f"Start from its configuration, with recipe=... or --recipe {run}"
     for robot in robots:

@@ -48,7 +48,6 @@ def train(
     iterations: PositiveInt | None = None,
     minutes: PositiveFloat | None = None,
     seed: Seed | None = None,
-    resume: bool = False,
     recipe: str | Path | None = None,
     weights: str | Path | None = None,
     teacher: str | Path | None = None,
@@ -58,12 +57,13 @@ def train(
 ) -> Path:
     """Train a policy by its rewards; or a student that sees the object, which imitates a teacher that is told its pose.
 
-    The same command continues a training that was stopped or killed, and does nothing if it is finished. After a
-    signal, it writes a checkpoint and exits with 128 and the signal's number: 130 after Ctrl-C, 143 after SIGTERM.
+    The same command continues a training that was stopped or killed, and does nothing if it is finished. So does the
+    command with no other options than --out, iterations and minutes, and reward terms of your own. After a signal, it
+    writes a checkpoint and exits with 128 and the signal's number: 130 after Ctrl-C, 143 after SIGTERM.
 
     Args:
-        bank: reset bank, made by xreset resets. Without a bank, every episode begins at home. With the banks of several
-            robots, one policy learns all of them, each in an equal share of the worlds.
+        bank: reset bank, made by xreset resets. With a goal set and no bank, every episode begins at home. With the
+            banks of several robots, one policy learns all of them, each in an equal share of the worlds.
         out: run folder to make, or to continue.
         robot: name or folder of the robot; default: that of the bank or of the goal set.
         goals: goal set, made by xreset goals. With a bank, its starts and goals are added to the demonstrated ones.
@@ -75,8 +75,6 @@ def train(
         minutes: time of the whole training, without compiling kernels: a run that continues has the rest of it. With
             iterations and minutes, the training ends with what is reached first.
         seed: seed of every random number; default: 0.
-        resume: continue the run in the folder as it was started: its other options need not be given. Name reward terms
-            of your own again.
         recipe: where the configuration starts from: a recipe (default, robust, minutes, any_object, live, paper,
             published), a TOML file of your own with the tables that it changes (docs/clusters.md), or another run's
             folder. Options --config.* change it; see them with xreset train --help-config [PART]. Reward terms of your
@@ -113,11 +111,11 @@ def train(
     out = Path(out)
     first, others = _first_and_others(bank, robot, goals, teacher)
     length = {"iterations": iterations, "minutes": minutes, "wandb": wandb}
-    if resume:
-        started = {"robot": robot, "meshes": meshes, "engine": engine, "device": device}
-        started |= {"num_envs": num_envs, "seed": seed, "teacher": teacher}
-        new = {"recipe": recipe, "weights": weights, "cameras": cameras or None}
-        training.refuse_changes(out, started, new, config, first, goals, others)
+    if first is None and goals is None:
+        given = {"robot": robot, "meshes": meshes, "engine": engine, "device": device}
+        given |= {"num_envs": num_envs, "seed": seed, "teacher": teacher}
+        given |= {"recipe": recipe, "weights": weights, "cameras": cameras or None}
+        training.refuse_options(out, given, config)
         own = config.task.reward.own if config else None
         return training.resume(out, own=own, **length)
     config = _configuration(config, recipe, weights, teacher, cameras, goals)

@@ -170,7 +170,15 @@ class Synthetic(InFolder):
         time[5:] += 0.07
         self.refused("--fps to resample", replace(PLAIN, fps=None), time=time)
         self.refused("must be in seconds", replace(PLAIN, fps=None), time=1e3 * (time - 5.0))
-        self.refused("must increase", time=time[::-1].copy())
+        backwards = r"must increase .* is \d.* in frame 0 and \d.* in the next one"
+        self.refused(backwards, time=time[::-1].copy())
+        moves = np.linalg.norm(np.diff(self.demos.object_pos, axis=0), axis=1)
+        hole = time + (np.arange(frames) > np.argmax(moves))
+        words = f"nothing is known for 1.1. s after frame {np.argmax(moves)}, in which the object"
+        self.refused(words, replace(PLAIN, fps=30.0), time=hole)
+        still = time + (np.arange(frames) > 0)
+        found = read_keypoints(self.npz(time=still), replace(PLAIN, fps=30.0))
+        self.assertEqual(found.num_frames, 3 * (frames + 9) + 3)
         time[-1] = 2e8
         self.refused("more than 100000 frames", replace(PLAIN, fps=30.0), time=time)
 

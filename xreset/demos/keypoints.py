@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from xreset.demos import hand
 from xreset.demos.archive import SIDES, Demos, merge_demos, one_sequence
+from xreset.demos.causes import length_text
 from xreset.demos.examine import examine, refuse_wrong, surfaces_of
 from xreset.demos.hand import ORDERS, Order
 from xreset.errors import DemoError
@@ -40,6 +41,10 @@ MAX_FRAMES = 100_000
 _KNUCKLES = [0, 5, 9, 13, 17]
 _UNEVEN = 0.1
 """Largest relative deviation of a time step from the median one for frames that count as evenly spaced."""
+_GAP = 0.3
+"""Longest time between two frames over which a moving object is interpolated [s]."""
+_GAP_MOTION = 0.02
+"""An object that moves farther in such a time moves [m]."""
 _USUAL_RATES = (24 / 1.001, 30 / 1.001, 60 / 1.001, 120 / 1.001)
 """Rates of video that are no whole numbers [1/s]."""
 _MATRIX_BYTES = 1 << 16
@@ -364,6 +369,8 @@ def _object_pose(arrays: Arrays) -> tuple[np.ndarray, Rotation]:
 
 def _evenly(arrays: Arrays, convention: Convention, motion: Motion) -> tuple[float, Motion]:
     """Return the rate, and the motion at that rate: as it is, or interpolated between its own times."""
+    if len(motion[1]) < 2:
+        raise DemoError("it has one frame. A demonstration has the start and the goal of the object.")
     if "time" not in arrays:
         rate = float(arrays["fps"]) if "fps" in arrays else convention.fps
         if rate is None:
@@ -375,8 +382,13 @@ def _evenly(arrays: Arrays, convention: Convention, motion: Motion) -> tuple[flo
         return rate, motion
     time = np.asarray(arrays["time"], dtype=float)
     steps = np.diff(time)
-    if len(time) < 2 or not (steps > 0).all():
-        raise DemoError("time must increase from frame to frame.")
+    if not (steps > 0).all():
+        frame = int(np.argmin(steps > 0))
+        later = f"{time[frame + 1]:.15g}"
+        raise DemoError(
+            f"time must increase from frame to frame, but it is {time[frame]:.15g} in frame {frame} and {later} in the"
+            " next one. Remove frames that are there twice; save times since 1970 in double precision (float64)."
+        )
     own = 1 / float(np.median(steps))
     if not 2 <= own <= RATE[1] or (own > 500 and convention.fps is None):
         raise DemoError(
@@ -405,9 +417,24 @@ def _evenly(arrays: Arrays, convention: Convention, motion: Motion) -> tuple[flo
         )
     at = np.minimum(time[0] + np.arange(int(frames) + 1) / rate, time[-1])
     points, pos, turn = motion
+    gap = _gap(time, pos)
+    if gap is not None:
+        raise DemoError(
+            f"nothing is known for {steps[gap]:.2f} s after frame {gap}, in which the object moves by"
+            f" {length_text(float(np.linalg.norm(pos[gap + 1] - pos[gap])))}. Give the frames before and after as two"
+            " sequences."
+        )
     # keypoints next to a frame without a hand become NaN
     points, pos = (interp1d(time, values, axis=0)(at) for values in (points, pos))
     return rate, (points, pos, Slerp(time, turn)(at))
+
+
+def _gap(time: np.ndarray, pos: np.ndarray) -> int | None:
+    """Return the frame [F] after which times [s] have a gap in which the object moves, or None."""
+    steps = np.diff(time)
+    moves = np.linalg.norm(np.diff(pos, axis=0), axis=1) > _GAP_MOTION
+    gaps = (steps > max(_GAP, 3 * float(np.median(steps)))) & moves
+    return int(np.argmax(gaps)) if gaps.any() else None
 
 
 def _rate(time: np.ndarray) -> float:

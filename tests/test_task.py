@@ -285,17 +285,16 @@ class RewardTest(TestCase):
                 self.reward(RewardConfig(terms={name: {"weight": 1.0} | term}))
         with self.assertRaisesRegex(ValueError, "Unknown gate 'ajar'. Choose from: touching"):
             self.reward(RewardConfig(gate={"ajar": {}}))
-        for terms in (
-            {"height": {}},
-            {"a:b": {"weight": math.nan}},
-            {"a:b": {"weight": "1"}},
-            {"a:b": {"weight": 1.0, "most": [1.0]}},
-            {"a:b": 1.0},
-            ["a:b"],
+        unweighted = "reward term 'a:b' has .*expected a weight.*terms.a:b.weight 1.0"
+        for terms, words in (
+            ({"a:b": {"most": 0.3}}, unweighted),
+            ({"a:b": {"weight": "1"}}, unweighted),
+            ({"a:b": {"weight": math.nan}}, "terms is "),
+            ({"a:b": {"weight": 1.0, "most": [1.0]}}, "terms is "),
+            ({"a:b": 1.0}, "terms is "),
+            (["a:b"], "terms is "),
         ):
-            with (
-                refuses(self, "terms is .* with a weight", ValueError, terms),
-            ):
+            with refuses(self, words, ValueError, terms):
                 RewardConfig(terms=terms)
 
     def test_the_contact_gate_needs_the_thumb_and_another_finger(self):

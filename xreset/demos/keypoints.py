@@ -370,7 +370,9 @@ def _object_pose(arrays: Arrays) -> tuple[np.ndarray, Rotation]:
 def _evenly(arrays: Arrays, convention: Convention, motion: Motion) -> tuple[float, Motion]:
     """Return the rate, and the motion at that rate: as it is, or interpolated between its own times."""
     if len(motion[1]) < 2:
-        raise DemoError("it has one frame. A demonstration has the start and the goal of the object.")
+        raise DemoError(
+            "it has one frame. A demonstration has the start and the goal of the object."
+        )
     if "time" not in arrays:
         rate = float(arrays["fps"]) if "fps" in arrays else convention.fps
         if rate is None:

@@ -26,7 +26,7 @@ from xreset.files.checks import (
 from xreset.files.text import shown
 from xreset.spec import FINGERS
 from xreset.task.legacy import ObservationOptions, RewardOptions
-from xreset.task.terms import Named, OneTerm, Terms, Weighted
+from xreset.task.terms import Named, OneTerm, Terms
 
 LONGEST_EPISODE = 1e6
 """Longest episode [s]: the largest time that a file of traces may hold."""
@@ -157,7 +157,7 @@ class RewardConfig(Checked):
 
     EARLIER = RewardOptions
 
-    terms: Weighted = _terms(
+    terms: Named = _terms(
         reach={"function": "best_reach", "weight": 1.0, "width": 0.1},  # m
         grasp={"weight": 1.0, "force": 0.1},  # N
         position={"weight": 4.0, "width": 0.2},  # m
@@ -176,6 +176,15 @@ class RewardConfig(Checked):
     """Largest distance to the goal that is a success [m] (section V)."""
     scale: PositiveFloat = 0.01
     """Factor on the total (Table VIII)."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name, term in self.terms.items():
+            if not isinstance(term.get("weight"), int | float):
+                raise WrongValueError(
+                    f"the reward term {shown(name)} has {shown(term)}, expected a weight as well: add"
+                    f" --config.task.reward.terms.{shown(name)[1:-1]}.weight 1.0"
+                )
 
     @property
     def own(self) -> Terms:

@@ -36,16 +36,9 @@ def _is_value(value: Any) -> bool:
     return isinstance(value, str) or isfinite(value)
 
 
-def _are_weighted(terms: Any) -> bool:
-    return _are_terms(terms) and all(
-        isinstance(term.get("weight"), int | float) for term in terms.values()
-    )
-
-
 _FORM = "name -> parameter -> finite number or word"
 Named = Annotated[Terms, Rule(f"terms: {_FORM}", _are_terms)]
 OneTerm = Annotated[Terms, Rule(f"one term: {_FORM}", lambda x: _are_terms(x) and len(x) == 1)]
-Weighted = Annotated[Terms, Rule(f"terms: {_FORM}, with a weight in each", _are_weighted)]
 
 
 class Functions(dict[str, Callable[..., Any]]):

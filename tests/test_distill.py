@@ -12,7 +12,7 @@ import torch
 from tests.data import refuses
 from tests.toy_bank import in_this_process
 from tests.toy_training import CONFIG, OPTIONS, WithBank, quickly
-from xreset import make_env, resume, train
+from xreset import make_env, train
 from xreset.cameras.config import FRONT, STUDENT_VISION, WRIST, VisionConfig
 from xreset.errors import PolicyError, XResetError
 from xreset.eval.report.fairness import missed_by_student
@@ -112,7 +112,7 @@ class DistillTest(WithBank):
         with quickly(), patch("xreset.learning.runner.TrainingLog.write", note):
             out = self.distill("points", POINTS, iterations=15, save_interval=100)
             before = read_checkpoint(latest_checkpoint(out))
-            resume(out, iterations=20)
+            train(out=out, iterations=20)
             after = read_checkpoint(latest_checkpoint(out))
         self.assertLess(np.mean(errors[-3:]), 0.5 * np.mean(errors[:3]))
         self.assertEqual((before.iteration, after.iteration), (15, 20))

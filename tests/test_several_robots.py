@@ -18,7 +18,6 @@ from xreset import (
     evaluate,
     load_policy,
     make_backend,
-    resume,
     robots,
     train,
     write_bank,
@@ -222,7 +221,7 @@ class TrainingTest(InOneFolder):
         self.assertEqual(info.contract.observation_layout["proprio"]["joint_pos_limits"], 24)
         self.assertEqual(len(checkpoints(self.out)), 2)
         with quickly():
-            resume(self.out, iterations=3)
+            train(out=self.out, iterations=3)
             train(out=self.out)
         self.assertEqual(len(checkpoints(self.out)), 3)
 

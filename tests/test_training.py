@@ -33,7 +33,6 @@ from xreset import (
     OnnxPolicy,
     export_checkpoint,
     read_bank,
-    resume,
     robots,
     train,
     write_bank,
@@ -126,7 +125,7 @@ class TrainingTest(WithBank):
     def resume(self, out, **options):
         """Continue a run without an export; returns what it printed."""
         with quickly() as said:
-            resume(out, **options)
+            train(out=out, **options)
         return said.getvalue()
 
     def test_what_a_run_holds(self):
@@ -500,7 +499,7 @@ class TrainingTest(WithBank):
         """The policy is exported where that is missing."""
         out = self.train("long")
         with redirect_stdout(io.StringIO()) as said:
-            resume(out, iterations=1)
+            train(out=out, iterations=1)
         self.assertIn("is trained", said.getvalue())
         self.assertEqual(read_policy(out).content, (out / "policy.onnx").read_bytes())
         self.assertEqual(read_run(out).config, CONFIG)

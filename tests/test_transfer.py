@@ -18,7 +18,6 @@ from tests.toy_bank import in_this_process, toy_retargeted
 from xreset import (
     SqueezeConfig,
     TransferConfig,
-    add_transfers,
     make_bank,
     read_bank,
     write_bank,
@@ -32,7 +31,7 @@ from xreset.physics import Health, State
 from xreset.pictures.view.load import load_view
 from xreset.resets.bank import starts_and_goals
 from xreset.resets.distribution import ResetDistribution
-from xreset.resets.transfer import _is_held
+from xreset.resets.transfer import _is_held, add_transfers
 from xreset.retarget.file import read_retargeted
 from xreset.robot_tools.verbs import judge
 from xreset.task.config import ResetConfig

@@ -29,7 +29,6 @@ from xreset.eval.verbs import stress as stress
 from xreset.geometry.description import load_robot as load_robot
 from xreset.learning.config import TrainConfig as TrainConfig
 from xreset.learning.export import export_checkpoint as export_checkpoint
-from xreset.learning.train import resume as resume
 from xreset.learning.verbs import train as train
 from xreset.live.deploy import deployed_graph as deployed_graph
 from xreset.objects.catalogue import load_object as load_object
@@ -47,7 +46,6 @@ from xreset.resets.config import TransferConfig as TransferConfig
 from xreset.resets.goals import GoalSet as GoalSet
 from xreset.resets.goals import read_goals as read_goals
 from xreset.resets.goals import write_goals as write_goals
-from xreset.resets.transfer import add_transfers as add_transfers
 from xreset.resets.verbs import make_bank as make_bank
 from xreset.resets.verbs import make_goals as make_goals
 from xreset.retarget.file import Retargeted as Retargeted

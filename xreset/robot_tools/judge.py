@@ -54,6 +54,8 @@ ANGLE = np.pi / 4
 """Largest change of the object's orientation in the palm's frame [rad]."""
 _REACH = 0.010
 """A finger presses if it is nearer than this to the object [m]."""
+_WORLDS = 32
+"""Worlds at a time."""
 _CLOSE_STEPS = 15
 """Control steps without weight."""
 _MOVE_STEPS = 45
@@ -136,7 +138,6 @@ def try_grasps(
     *,
     states: int,
     squeeze: SqueezeConfig,
-    num_envs: int,
     device: str,
     progress: Progress,
 ) -> Judgement:
@@ -154,7 +155,7 @@ def try_grasps(
         before = number * count
         table = probe(
             engine, scene, tried.object_name, start, partial(_play, Kinematics(robot)), gravity=0.0,
-            steps=_CLOSE_STEPS, num_envs=num_envs, device=device,
+            steps=_CLOSE_STEPS, num_envs=_WORLDS, device=device,
             progress=lambda done, before=before: progress(before + done, len(engines) * count),
         )  # fmt: skip
         verdicts = table[:, : 1 + len(PHASES)].astype(int)

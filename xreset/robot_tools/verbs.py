@@ -167,7 +167,6 @@ def judge(
     meshes: str | Path | None = None,
     states: PositiveInt = 8,
     squeeze: SqueezeConfig = SqueezeConfig(),
-    num_envs: PositiveInt = 32,
     device: Device = "cpu",
     picture: Png | None = None,
     progress: Callable[[float, int], None] = unseen,
@@ -192,7 +191,6 @@ def judge(
             the object, as many from each demonstration as possible. States in grasps of other demonstrations are left
             out: they were chosen because they hold.
         squeeze: how hard fingers press that are within 10 mm of the object, the same on every object.
-        num_envs: worlds at a time.
         device: where engines run that can use a GPU: cpu or cuda; the others run on the CPU.
         picture: PNG to write: the best state of each object at the start and after each phase.
         progress: called with (states done, states in all); then again with demonstrations.
@@ -215,7 +213,6 @@ def judge(
         chosen,
         states=states,
         squeeze=squeeze,
-        num_envs=num_envs,
         device=device,
         progress=progress,
     )

@@ -1,4 +1,4 @@
-"""Policies that need no training: zero, random, and open-loop kinematic retargeting."""
+"""Policies that need no training: zero, and open-loop kinematic retargeting."""
 
 from __future__ import annotations
 
@@ -24,20 +24,6 @@ class ZeroPolicy(Policy):
         """[N, J] zeros."""
         flat = observations["policy"]
         return flat.new_zeros(len(flat), self._num_actions)
-
-
-class RandomPolicy(Policy):
-    """Uniform actions in [-1, 1], the same for the same seed in every engine."""
-
-    def __init__(self, num_actions: int, seed: int) -> None:
-        self._num_actions = num_actions
-        self._generator = torch.Generator().manual_seed(seed)
-
-    def act(self, observations: TensorDict) -> Tensor:
-        """[N, J] uniform."""
-        flat = observations["policy"]
-        share = torch.rand(len(flat), self._num_actions, generator=self._generator)
-        return (2.0 * share - 1.0).to(flat.device)
 
 
 class KinematicRetargeting(Policy):

@@ -33,7 +33,7 @@ from xreset.task.contract import Contract
 if TYPE_CHECKING:  # functions import torch, which playing a deployed policy does not need
     from xreset.env.manipulation import ManipulationEnv
 
-BASELINES = ("zero", "random", "ik")
+BASELINES = ("zero", "ik")
 """Names of the policies that need no training."""
 DEFAULT = "many-objects"
 """Policy that is played where neither a policy nor a robot is named."""
@@ -186,9 +186,7 @@ def default_policy(robot: str | Path | None) -> str:
     return name
 
 
-def load_policy(
-    policy: str | Path | PolicySpec, *, robot: str | Path | None = None, seed: Seed = 0
-) -> PolicySpec:
+def load_policy(policy: str | Path | PolicySpec, *, robot: str | Path | None = None) -> PolicySpec:
     """Load the policy that a name means. A file or folder comes before a shipped policy of the same name.
 
     Args:
@@ -196,7 +194,6 @@ def load_policy(
             (``docs/live.md``), name of a policy that ships with xreset, name of a robot for which one ships, or one of
             :data:`BASELINES`. A loaded policy is returned as it is; ``robot`` must be its own then.
         robot: name or folder of the robot; default: the policy's own, or the first of several. Baselines need it.
-        seed: seed of the baseline ``random``.
 
     Raises:
         PolicyError: the policy is unknown, or does not fit the robot.
@@ -214,7 +211,7 @@ def load_policy(
             f"policy is {shown(policy)}, expected a name, a path or a PolicySpec (docs/gymnasium.md)."
         )
     if str(policy) in BASELINES:
-        return _baseline(str(policy), robot, seed)
+        return _baseline(str(policy), robot)
     found = find_policy(policy, also=BASELINES)
     run = found.run
     is_graph = is_deployed(found.content)
@@ -266,7 +263,7 @@ def _opened_graph(found: PolicyFile) -> tuple[Contract, Start]:
     return training_of(Controller(found.content, source), source), start
 
 
-def _baseline(name: str, robot: str | Path | None, seed: int) -> PolicySpec:
+def _baseline(name: str, robot: str | Path | None) -> PolicySpec:
     if robot is None:
         raise PolicyError(f"The baseline {name!r} needs a robot. Name it (robot=... or --robot).")
     spec = load_robot(robot)
@@ -276,8 +273,6 @@ def _baseline(name: str, robot: str | Path | None, seed: int) -> PolicySpec:
 
         if name == "zero":
             return baselines.ZeroPolicy(len(spec.joints))
-        if name == "random":
-            return baselines.RandomPolicy(len(spec.joints), seed)
         if motion is None:
             raise PolicyError("The baseline 'ik' follows recorded motion. Use xreset.evaluate.")
         return baselines.KinematicRetargeting(motion)

@@ -63,7 +63,7 @@ def evaluate(
 
     Args:
         policy: run folder, one of its checkpoints (.pt), exported or deployed policy (.onnx), or name of a policy that
-            ships with xreset (xreset policies); or a baseline: zero, random, ik (open-loop kinematic retargeting).
+            ships with xreset (xreset policies); or a baseline: zero, ik (open-loop kinematic retargeting).
         demos: starts and goals, and the path of ik: demonstrations (xreset demos), retargeted motion (xreset retarget)
             or a goal set (xreset goals).
         engines: physics engine to play in; several are played from the same starts.
@@ -92,7 +92,7 @@ def evaluate(
     from xreset.eval.results import Evaluation
     from xreset.eval.rollout import chosen_engines, load_trial
 
-    spec = load_policy(policy, robot=robot, seed=seed)
+    spec = load_policy(policy, robot=robot)
     played_engines = chosen_engines(engines, device)
     trial = load_trial(
         spec,
@@ -180,7 +180,7 @@ def stress(
     from xreset.eval.rollout import chosen_engines, load_trial
 
     on_robot = faults or any(prop.is_fault for prop in wanted)
-    spec = load_policy(policy, robot=robot, seed=seed)
+    spec = load_policy(policy, robot=robot)
     if on_robot:
         spec.exported()  # refuses a baseline
     if demos is None:

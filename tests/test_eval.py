@@ -276,7 +276,7 @@ class MetricsTest(TestCase):
 class RecordedTest(TestCase):
     def test_distances_are_those_of_the_recorded_states(self):
         """Objects fall past their goals, and numpy computes the distances of every recorded control step again."""
-        policy = load_policy("random", robot="ur7e-sharpa")
+        policy = load_policy("zero", robot="ur7e-sharpa")
         short = replace(policy.task.termination, episode_seconds=0.4)
         policy = replace(policy, task=replace(policy.task, termination=short))
         falling = toy_bank(policy.robot)

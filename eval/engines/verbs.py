@@ -202,7 +202,7 @@ def attribute(
 
     Args:
         policy: run folder, one of its checkpoints (.pt), exported policy (.onnx), name of a policy that ships with
-            xreset (xreset policies), or a baseline: zero, random, ik (open-loop kinematic retargeting).
+            xreset (xreset policies), or a baseline: zero, ik (open-loop kinematic retargeting).
         demos: demonstrations (xreset demos) or retargeted motion (xreset retarget): starts and goals, and the path of
             ik. xreset demos select makes a file of some objects.
         towards: engine towards which the properties are changed, usually the one in which the policy does worse.
@@ -230,7 +230,7 @@ def attribute(
 
     if engine == towards:
         raise XResetError(f"engine and towards are both {engine!r}. Choose two engines.")
-    spec = load_policy(policy, robot=robot, seed=seed)
+    spec = load_policy(policy, robot=robot)
     a, b = chosen_engines([engine, towards], device)
     trial = load_trial(spec, demos, meshes=meshes, seed=seed, num_envs=num_envs)
     folder = Path(out) if out else spec.folder.parent / "attribute"

@@ -135,7 +135,7 @@ class Runs(Checked):
     """Train a policy for each object, not one for all."""
     per_object: PositiveInt | None = None
     """Largest number of demonstrations of each object."""
-    policy: Literal["ik", "zero", "random"] | None = None
+    policy: Literal["ik", "zero"] | None = None
     """A baseline, which is evaluated and not trained."""
     recipe: str = "default"
     config: dict[str, Any] = field(default_factory=dict)

@@ -257,7 +257,7 @@ class CommandTest(InFolder):
         found = outcome({"arm-stiffness": [0.33] * 8})
         options = ("--robot", "openarm", "--demos", demos, "--towards", "sapien")
         options += ("--out", self.folder / "made", "--episodes", 3, "--seed", 4)
-        options += ("--only", "arm stiffness")
+        options += ("--property", "arm stiffness")
         with patch("xreset.eval.engines.attribution.attribute", return_value=found) as attribute:
             said = succeeds("engines", "attribute", "zero", *options)
         spec, a, b, trial, out = attribute.call_args.args

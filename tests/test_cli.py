@@ -163,6 +163,11 @@ class UsageTest(TestCase):
     def test_earlier_names_of_flags_are_taken(self):
         for words, told in (
             ("engines check --backend bulet", ["--backend is now --engine"]),
+            ("engines compare none --only mug", ["--only is now --object"]),
+            (
+                "engines attribute zero --demos none --towards x --only effort",
+                ["--only is now --property"],
+            ),
             ("objects list --objects=none", ["--objects is now --meshes", "no folder 'none'"]),
             ("demos synth --out x.npz --objects nothing", ["Unknown object 'nothing'"]),
         ):

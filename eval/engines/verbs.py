@@ -82,7 +82,7 @@ def compare_engines(
     *,
     robot: str | Path | None = None,
     meshes: str | Path | None = None,
-    only: Sequence[str] = (),
+    names: Annotated[Sequence[str], Option("object")] = (),
     grasps: PositiveInt = 48,
     device: Device = "cpu",
     json: Output | None = None,
@@ -100,7 +100,7 @@ def compare_engines(
         engines: physics engine to measure, or several; the command's default: all that can be used here.
         robot: name or folder of the robot; default: the file's.
         meshes: folder of real meshes; default: as the file names it, else the stand-ins.
-        only: object to use, or several; default: all objects of the file.
+        names: object to use, or several; default: all objects of the file.
         grasps: number of closings, and of holds.
         device: where engines run that can use a GPU: cpu or cuda; the others run on the CPU.
         json: file to write the results to.
@@ -115,7 +115,7 @@ def compare_engines(
     from xreset.resets.inputs import load_inputs
 
     tested = [each for each in chosen_engines(engines, device) if each.name != agreement.REFERENCE]
-    inputs = load_inputs(motion, robot=robot, meshes=meshes, only=only, accept=("demos", "motion"))
+    inputs = load_inputs(motion, robot=robot, meshes=meshes, only=names, accept=("demos", "motion"))
     grasped = inputs.motion(partial(progress, "retargeting"))
     # hashed now, because after minutes of work the file may have changed
     hashes = {"motion": file_hash(motion)}
@@ -184,7 +184,7 @@ def attribute(
     towards: str | Engine,
     engine: str | Engine = "mujoco",
     *,
-    only: str | Sequence[str] = (),
+    properties: Annotated[str | Sequence[str], Option("property")] = (),
     episodes: PositiveInt = 1,
     robot: str | Path | None = None,
     meshes: str | Path | None = None,
@@ -207,7 +207,7 @@ def attribute(
             ik. xreset demos select makes a file of some objects.
         towards: engine towards which the properties are changed, usually the one in which the policy does worse.
         engine: engine in which the properties are changed.
-        only: property to change, or several; default: all in which the engines differ.
+        properties: property to change, or several; default: all in which the engines differ.
         episodes: episodes of each demonstration.
         robot: name or folder of the robot; default: the policy's own. Baselines need it.
         meshes: folder of real meshes; default: what the policy was trained with, else the stand-ins.
@@ -234,7 +234,7 @@ def attribute(
     a, b = chosen_engines([engine, towards], device)
     trial = load_trial(spec, demos, meshes=meshes, seed=seed, num_envs=num_envs)
     folder = Path(out) if out else spec.folder.parent / "attribute"
-    wanted = [only] if isinstance(only, str) else only
+    wanted = [properties] if isinstance(properties, str) else properties
     return attribution.attribute(
         spec, a, b, trial, folder, episodes=episodes, only=wanted, progress=progress
     )

@@ -109,6 +109,11 @@ _GONE = {
     "select": "evaluate checkpoints, xreset eval RUN/checkpoints/NUMBER.pt, and compare them with xreset report",
 }
 """Command of earlier versions -> what to do in place of it."""
+_RENAMED_IN = {
+    "engines compare": {"--only": "--object"},
+    "engines attribute": {"--only": "--property"},
+}
+"""Command -> flag of earlier versions -> its present name."""
 _NEEDLESS = {
     "--resume": "a training continues with --out RUN alone, or with its whole command",
 }
@@ -132,7 +137,7 @@ def _with_present_flags(argv: list[str]) -> list[str]:
             present = "train"  # continues a run, and names no teacher
         argv = [*present.split(), *argv[count:]]
         break
-    changed = dict(_RENAMED)
+    changed = _RENAMED | _RENAMED_IN.get(" ".join(argv[:2]), {})
     if argv[:2] in _NAME_OBJECTS:
         del changed["--objects"]
     words = []

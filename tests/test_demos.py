@@ -431,7 +431,7 @@ class Synthetic(InFolder):
             b = again.select(objects=[name])
             for array in ("hand_keypoints", "wrist_quat_wxyz", "object_pos", "object_quat_wxyz"):
                 self.assertEqual(getattr(a, array).tobytes(), getattr(b, array).tobytes())
-        self.assertNotEqual(synthesize(["soup"], 1, seed=1).object_pos[0, 0], b.object_pos[0, 0])
+        self.assertNotEqual(synthesize("soup", 1, seed=1).object_pos[0, 0], b.object_pos[0, 0])
 
     def test_a_wall_of_ones_own_mesh_is_held_from_both_sides(self):
         trimesh.creation.annulus(0.0365, 0.04, 0.09, sections=16).export(self.folder / "tube.obj")

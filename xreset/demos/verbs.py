@@ -134,7 +134,7 @@ def synthesize(
     The same arguments give the same arrays, and a sequence does not depend on the other sequences.
 
     Args:
-        names: objects to grasp, by their official names or the paper's; default: all.
+        names: object to grasp, or several, by their official names or the paper's; default: all.
         per_object: sequences of each object (and hand).
         seed: the same seed gives the same file. It chooses all that varies: place and heading of the object, grasp,
             paths, timing, goal pose.
@@ -152,7 +152,8 @@ def synthesize(
     from xreset.demos.synth import synthetic_demos
 
     sides = ("right", "left") if side == "both" else (side,)
-    names = None if names is None else list(names)
+    if names is not None:
+        names = [names] if isinstance(names, str) else list(names)
     demos = synthetic_demos(
         names, per_object, seed, fps=fps, sides=sides, meshes=meshes, progress=progress
     )

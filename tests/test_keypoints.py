@@ -154,6 +154,8 @@ class Synthetic(InFolder):
         ):
             with self.assertRaisesRegex(FileFormatError, words):
                 read_keypoints(self.npz(**changes), PLAIN)
+        with self.assertRaisesRegex(FileFormatError, "no schema, .*archive of xreset demos"):
+            read_demos(self.npz())
         (self.folder / "empty").mkdir()
         with self.assertRaisesRegex(DemoError, "no .npz and no .csv"):
             read_keypoints(f"{self.folder}/empty", PLAIN)

@@ -19,18 +19,22 @@ if TYPE_CHECKING:
 def _show(bank: ResetBank, options: Mapping[str, Any]) -> None:
     title = f"{bank.robot}: states stable in {', '.join(bank.engines)}"
     show_accounts(bank.accounts(), title)
-    if bank.num_pressing:
-        console.print(
-            f"{bank.num_pressing} of {bank.post_contact.sum()} states after contact press"
-        )
     own = int(bank.own_grasp.sum())
     tried = own + len(bank.rejected_reason)
-    console.print(f"{own} states of {tried} kept in {options['out']}")
+    kept = f"{own} states of {tried} kept in {options['out']}"
+    if bank.frame_part is not None:
+        between = np.count_nonzero(bank.own_grasp & (bank.frame_part > 0))
+        kept += f", {between} of them closing states between frames"
+    console.print(kept)
     added = bank.sequence_index[~bank.own_grasp]
     if len(added):
         console.print(
             f"{len(added)} states in grasps of other demonstrations added, to {len(np.unique(added))} of "
             f"{len(bank.sequence_name)} demonstrations"
+        )
+    if bank.num_pressing:
+        console.print(
+            f"{bank.num_pressing} of {bank.post_contact.sum()} states after contact press"
         )
     if bank.object_depth is not None and bank.num_states:
         console.print(depth_text(bank.object_depth, "all states"))

@@ -411,9 +411,7 @@ def read_demos(path: str | Path) -> Demos:
         FileFormatError: the file is missing, damaged or not an archive, or a value in it is wrong: the message names
             sequence and frame.
     """
-    demos = read_record(
-        Demos, path, SCHEMA_NAME, what="an archive of demonstrations", check=_problem
-    )
+    demos = read_record(Demos, path, SCHEMA_NAME, what="an archive of xreset demos", check=_problem)
     names = [official_name(name) for name in demos.object_name.tolist()]
     if names != demos.object_name.tolist():
         demos = replace(demos, object_name=np.array(names))

@@ -20,8 +20,8 @@ Rows = Sequence[Sequence[str]]
 
 
 VERSIONS = (
-    "Published success and distance (mean of 64 surface points, least over the episode) are the published paper's. "
-    "The others are its draft's."
+    "Published success and distance (mean of 64 surface points, least over the episode) are metrics of the published "
+    "paper, the others of its draft."
 )
 """Note under every table: the version of the paper that each metric is from."""
 OPEN_LOOP = (

@@ -219,6 +219,7 @@ class Synthetic(InFolder):
             ("separated by semicolons", first.replace(",", ";")),
             ("more than 21 keypoints, such as x21.*OpenXR", first.replace("confidence", "x21")),
             ("same name", first.replace("z20", "z19")),
+            ("first line has numbers", first.partition("\n")[2]),
             ("column side changes", first.replace(",right,", ",left,", 1)),
         ):
             path.write_text(text)

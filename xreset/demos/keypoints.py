@@ -240,6 +240,10 @@ def _table(path: Path) -> dict[str, list[str]]:
             raise ValueError(
                 f"its cells are separated by {word}, expected commas, and points in decimal numbers"
             )
+    if any(re.fullmatch(r"[-+.\d]+(e[-+]?\d+)?", name) for name in names):
+        raise ValueError(
+            "its first line has numbers, expected the names of the columns (docs/demonstrations.md)"
+        )
     if len(set(names)) < len(names):
         raise ValueError("several columns have the same name")
     for number, row in rows:
@@ -257,7 +261,9 @@ def _numbers(table: dict[str, list[str]], column: str) -> np.ndarray:
     try:
         return np.array([float(cell.strip() or "nan") for cell in table[column]])
     except ValueError as error:
-        raise ValueError(f"column {column}: {error}") from error
+        raise ValueError(
+            f"column {column}: {error}. Leave cells empty where the hand was not seen"
+        ) from error
 
 
 # One sequence ---------------------------------------------------------------------------------------------------------

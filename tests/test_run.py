@@ -61,3 +61,5 @@ class Run(InFolder, TestCase):
             with patch.object(command, "perform") as performed:
                 refused("run", demos, *words, "--out", out)
             self.assertFalse(performed.called or out.exists(), wrong)
+        said = refused("run", demos, "--robot", "openarm", "--out", demos / "run")
+        self.assertIn("cannot make the folder", said)

@@ -14,7 +14,7 @@ from xreset.cli._verbs import verb
 from xreset.errors import RunError
 from xreset.files.checks import PositiveFloat, PositiveInt, Seed, obeys_rules
 from xreset.files.records import stated_inputs
-from xreset.files.storage import file_hash
+from xreset.files.storage import claim_folder, file_hash
 from xreset.learning.run import read_run
 from xreset.physics.plugins import Device, backend_class
 
@@ -91,7 +91,8 @@ def run(
     motion = out / "motion.npz"
     bank = out / "resets.npz"
     _refuse_other_training(out, bank)
-    out.mkdir(parents=True, exist_ok=True)
+    with claim_folder(out):  # refused if it cannot be made, or another command writes into it
+        pass
     if motion.is_file():
         check_robot(motion, "file of motion", read_retargeted(motion), spec)
     if not _made_from(motion, demos=file_hash(demos)):

@@ -6,8 +6,9 @@ Shape letters: T frames, J actuated joints.
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -99,28 +100,19 @@ def read_recorded(
         results = results_in(Path(folder))
         evaluation = read_evaluation(results)
         for result in evaluation:
-            engine = result.engine
-            if wanted and engine not in wanted:
+            if wanted and result.engine not in wanted:
                 continue
             name = str(robot or result.robot)
-            spec = robots[name] = robots.get(name) or load_robot(name)
-            traces = read_traces(results, engine, spec.joint_names)
-            file = results / f"{engine}.trace.npz"
+            if name not in robots:
+                robots[name] = load_robot(name)
+            file = results / f"{result.engine}.trace.npz"
+            traces = read_traces(results, result.engine, robots[name].joint_names)
             inputs[f"trace {len(inputs)}"] = file_hash(file)
-            shown = recorded(evaluation.to_frame(), engine, traces)
-            for episode in shown.to_dict("records"):
-                trace = episode["trace"]
-                action = _actions(trace, file)
-                intervals.setdefault(round(float(np.median(np.diff(trace.time))), 6), results)
-                if not (trace.finite.all() and np.isfinite(action).all()):
-                    logging.getLogger(__name__).warning(
-                        "%s, %s, demonstration %d is left out: its engine broke down.",
-                        results,
-                        engine,
-                        trace.sequence,
-                    )
-                    continue
-                episode["task"] = (task or TASK).replace("{object}", short_name(trace.object))
+            for trace in traces:
+                intervals.setdefault(_interval(trace), results)
+            table = recorded(evaluation.to_frame(), result.engine, traces)
+            for episode, action in _sound_episodes(table, file):
+                episode["task"] = (task or TASK).replace("{object}", short_name(episode["object"]))
                 episode["action"] = action
                 episode["meshes"] = result.meshes_folder(meshes)
                 rows.append(episode)
@@ -144,6 +136,28 @@ def read_recorded(
         episodes=pd.DataFrame(rows),
         inputs=inputs,
     )
+
+
+def _interval(trace: Trace) -> float:
+    """Return the time from one state to the next [s]."""
+    return round(float(np.median(np.diff(trace.time))), 6)
+
+
+def _sound_episodes(table: Table, file: Path) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
+    """Yield recorded episodes and their actions [T, J]; an episode in which the engine broke down is left out, with a
+    warning."""
+    for episode in table.to_dict("records"):
+        trace = episode["trace"]
+        action = _actions(trace, file)
+        if trace.finite.all() and np.isfinite(action).all():
+            yield episode, action
+            continue
+        logging.getLogger(__name__).warning(
+            "%s, %s, demonstration %d is left out: its engine broke down.",
+            file.parent,
+            episode["engine"],
+            trace.sequence,
+        )
 
 
 def _actions(trace: Trace, file: Path) -> np.ndarray:

@@ -375,46 +375,41 @@ def _parsed(xml: Element) -> yourdfpy.Robot:
 def _use_visuals(xml: Element, path: Path) -> None:
     """Make collision shapes of the visual ones in all bodies that have no collision shape, if the last body of a chain
     is such a one: then the file's collision shapes are not complete."""
-    carriers = {}
     joints = [joint for joint in xml.iterfind("joint") if joint.find("child") is not None]
-    for joint in joints:
-        if joint.get("type") == "fixed":
-            carriers[_end(joint, "child")] = _end(joint, "parent")
-
-    def body(name: str) -> str:
-        """Return the link that carries a link by fixed joints."""
-        for _ in carriers:
-            name = carriers.get(name, name)
-        return name
-
-    links = xml.findall("link")
-    bodies = [body(link.get("name", "")) for link in links]
-    carrying = {body(_end(joint, "parent")) for joint in joints if joint.get("type") != "fixed"}
+    moving = [joint for joint in joints if joint.get("type") != "fixed"]
+    carriers = {_end(j, "child"): _end(j, "parent") for j in joints if j.get("type") == "fixed"}
+    carrying = {_body(_end(joint, "parent"), carriers) for joint in moving}
+    visuals: dict[str, list[tuple[Element, Element]]] = {}
     solid = set()
-    shown_only = set()
-    for link, name in zip(links, bodies, strict=True):
+    for link in xml.iterfind("link"):
+        name = _body(link.get("name", ""), carriers)
         if link.find("collision") is not None:
             solid.add(name)
-        if link.find("visual") is not None:
-            shown_only.add(name)
-    shown_only -= solid
-    if shown_only <= carrying:
+        for visual in link.iterfind("visual"):
+            visuals.setdefault(name, []).append((link, visual))
+    shown_only = {name: found for name, found in visuals.items() if name not in solid}
+    if shown_only.keys() <= carrying:
         return
-    shapes: dict[str, list[tuple[Element, Element]]] = {name: [] for name in shown_only}
-    for link, name in zip(links, bodies, strict=True):
-        if name in shown_only:
-            shapes[name] += [(link, visual) for visual in link.iterfind("visual")]
-    for name, found in shapes.items():
-        there = []
-        for link, visual in found:
-            mesh = visual.find("geometry/mesh")
-            if mesh is None or find_mesh(mesh.get("filename", ""), path):
-                there.append((link, visual))
+    for name, found in shown_only.items():
+        there = [(link, visual) for link, visual in found if _is_there(visual, path)]
         # the end of a chain needs a shape: without its meshes, reading them says which file is missing
-        needed = found if name not in carrying and not there else there
+        needed = there if there or name in carrying else found
         for link, visual in needed:
             shape = SubElement(link, "collision")
             shape.extend(part for part in visual if part.tag in ("origin", "geometry"))
+
+
+def _body(link: str, carriers: dict[str, str]) -> str:
+    """Return the link that carries a link by fixed joints; ``carriers``: link -> the link that it is fixed to."""
+    for _ in carriers:
+        link = carriers.get(link, link)
+    return link
+
+
+def _is_there(visual: Element, path: Path) -> bool:
+    """Return whether a shape needs no mesh, or its mesh can be found."""
+    mesh = visual.find("geometry/mesh")
+    return mesh is None or bool(find_mesh(mesh.get("filename", ""), path))
 
 
 def _end(joint: Element, end: str) -> str:

@@ -294,46 +294,35 @@ def _tree(
     The origin of a link is at its joint, which may be away from the body's origin.
     """
     names = [model.body(i).name or f"body{i}" for i in range(model.nbody)]
-    hinged = np.unique(model.jnt_bodyid[model.jnt_type >= SLIDE])
-    tops = np.flatnonzero(model.body_parentid[1:] == 0) + 1
-    kept = np.intersect1d(tops, model.body_rootid[hinged])
-    if not len(kept):
-        raise RobotError(f"{path} has no body with a hinge or a slide, so it has no robot.")
-    absent = [names[i] for i in tops if i not in kept]
-    if absent:
-        notes.append(f"left out: bodies of the world that have no joint: {listed(absent)}")
-    root = names[kept[0]]
-    if len(kept) > 1 or kept[0] in hinged:
-        root = "world_frame"
-        names[0] = root
+    kept = _kept_trees(path, model, names, notes)
+    if len(kept) > 1 or _moving(model, kept[0]):
+        names[0] = "world_frame"
+        root = names[0]
+    else:
+        root = names[kept[0]]
     links = {root: frame(root)}
     joints = []
     poses = {root: np.eye(4)}
-    data = mujoco.MjData(model)
-    data.qpos[model.jnt_qposadr[model.jnt_type >= SLIDE]] = 0.0
-    for joint, line in couplings.lines.items():
-        if not line.multiplier:
-            data.qpos[model.jnt_qposadr[joint]] = line.offset
-    mujoco.mj_kinematics(model, data)
+    data = _posed(model, couplings)
     for number in range(1, model.nbody):
         if model.body_rootid[number] not in kept:
             continue
-        body = model.body(number)
         name = names[number]
-        moving = np.flatnonzero((model.jnt_bodyid == number) & (model.jnt_type >= SLIDE)).tolist()
-        above = names[int(body.parentid[0])]
-        turn = data.xmat[number].reshape(3, 3).T
-        T = transform(turn.T, data.xpos[number])
+        above = names[model.body_parentid[number]]
+        R = data.xmat[number].reshape(3, 3)
+        T = transform(R, data.xpos[number])
+        # a link for each joint of the body, of which the last one is the body itself
+        moving = _moving(model, number)
         children = [*(f"{name}_axis{i}" for i in range(len(moving) - 1)), name]
         for child, joint in zip(children, moving, strict=False):
-            T = transform(turn.T, data.xanchor[joint])
+            T = transform(R, data.xanchor[joint])
             poses[child] = T
             links[child] = frame(child)
             placed = Joint(
                 parent=above,
                 child=child,
                 T_parent_joint=np.linalg.inv(poses[above]) @ T,
-                axis=turn @ data.xaxis[joint],
+                axis=R.T @ data.xaxis[joint],
                 **_motion(model, couplings, joint),
             )
             joints.append(placed)
@@ -341,14 +330,7 @@ def _tree(
         poses[name] = T
         if not moving and name != root:
             joints.append(fixed(above, name, np.linalg.inv(poses[above]) @ T))
-        R = turn @ data.ximat[number].reshape(3, 3)
-        links[name] = Link(
-            name=name,
-            mass=float(body.mass[0]),
-            com=turn @ (data.xipos[number] - T[:3, 3]),
-            inertia=R @ np.diag(body.inertia) @ R.T,
-            collisions=tuple(_shapes(model, data, number, solid, T)),
-        )
+        links[name] = _link(model, data, number, name, T, solid)
     order = [root, *(joint.child for joint in joints)]
     pairs = [(names[pair >> 16], names[pair & 0xFFFF]) for pair in model.exclude_signature.tolist()]
     return RobotTree(
@@ -357,6 +339,56 @@ def _tree(
         links=tuple(links[name] for name in order),
         joints=tuple(joints),
         exclude=tuple(pair for pair in pairs if {*pair} <= {*order}),
+    )
+
+
+def _kept_trees(
+    path: Path, model: mujoco.MjModel, names: list[str], notes: list[str]
+) -> np.ndarray:
+    """Return the bodies of the world that have a joint, or that carry bodies with one; note the others."""
+    jointed = np.unique(model.jnt_bodyid[model.jnt_type >= SLIDE])
+    tops = np.flatnonzero(model.body_parentid[1:] == 0) + 1
+    kept = np.intersect1d(tops, model.body_rootid[jointed])
+    if not len(kept):
+        raise RobotError(f"{path} has no body with a hinge or a slide, so it has no robot.")
+    absent = [names[i] for i in tops if i not in kept]
+    if absent:
+        notes.append(f"left out: bodies of the world that have no joint: {listed(absent)}")
+    return kept
+
+
+def _moving(model: mujoco.MjModel, body: int) -> list[int]:
+    """Return the hinges and slides of a body."""
+    return np.flatnonzero((model.jnt_bodyid == body) & (model.jnt_type >= SLIDE)).tolist()
+
+
+def _posed(model: mujoco.MjModel, couplings: Couplings) -> mujoco.MjData:
+    """Return the poses of all bodies where the joints are at 0, or where a coupling holds them."""
+    data = mujoco.MjData(model)
+    data.qpos[model.jnt_qposadr[model.jnt_type >= SLIDE]] = 0.0
+    for joint, line in couplings.lines.items():
+        if not line.multiplier:
+            data.qpos[model.jnt_qposadr[joint]] = line.offset
+    mujoco.mj_kinematics(model, data)
+    return data
+
+
+def _link(
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    number: int,
+    name: str,
+    T: np.ndarray,
+    solid: np.ndarray,
+) -> Link:
+    """Return a body as a link whose frame has the pose ``T``."""
+    R = T[:3, :3].T @ data.ximat[number].reshape(3, 3)
+    return Link(
+        name=name,
+        mass=float(model.body_mass[number]),
+        com=T[:3, :3].T @ (data.xipos[number] - T[:3, 3]),
+        inertia=R @ np.diag(model.body_inertia[number]) @ R.T,
+        collisions=tuple(_shapes(model, data, number, solid, T)),
     )
 
 

@@ -23,7 +23,7 @@ from xreset import robots
 from xreset.cameras.config import FRONT, VisionConfig
 from xreset.cli._terms import take_terms
 from xreset.errors import DemoError, FileFormatError, PolicyError, RunError
-from xreset.eval.baselines import RandomPolicy, ZeroPolicy
+from xreset.eval.baselines import ZeroPolicy
 from xreset.files.checks import from_dict, merged
 from xreset.geometry.rotations import (
     quat_angle,
@@ -1397,11 +1397,7 @@ class PolicyTest(TestCase):
         ):
             self.refused(words, replace(self.TASK, **changes))
 
-    def test_policies_without_training(self):
-        observations = {"policy": torch.zeros(300, 22)}
-        self.assertFalse(ZeroPolicy(7).act(observations).any())
-        one, same, other = (RandomPolicy(7, seed).act(observations) for seed in (1, 1, 2))
-        self.assertTrue(torch.equal(one, same))
-        self.assertFalse(torch.equal(one, other))
-        self.assertEqual(tuple(one.shape), (300, 7))
-        self.assertTrue(-1 <= one.min() < -0.97 and 0.97 < one.max() <= 1)
+    def test_a_policy_without_training(self):
+        action = ZeroPolicy(7).act({"policy": torch.zeros(300, 22)})
+        self.assertEqual(tuple(action.shape), (300, 7))
+        self.assertFalse(action.any())

@@ -14,7 +14,6 @@ import torch
 
 from tests import toy_grasp
 from xreset.env.manipulation import ManipulationEnv, make_scene
-from xreset.eval.baselines import RandomPolicy
 from xreset.eval.report.read import read_curves
 from xreset.learning.config import ModelConfig, PpoConfig, TrainConfig
 from xreset.learning.recipes import RECIPES
@@ -88,10 +87,11 @@ def bank():
 def random_policy(seed, backend):
     """What uniform actions do in one episode."""
     env = environment(seed, backend)
-    policy = RandomPolicy(env.num_actions, seed)
+    generator = torch.Generator().manual_seed(seed)
     logs = []
     for _ in range(env.max_episode_length):
-        *_, extras = env.step(policy.act(env.get_observations()))
+        share = torch.rand(env.num_envs, env.num_actions, generator=generator)
+        *_, extras = env.step(2.0 * share - 1.0)
         logs.append(extras["log"])
     return shares(lambda name: np.mean([log[name] for log in logs]))
 

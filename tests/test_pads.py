@@ -1,22 +1,32 @@
-"""Jaws: their pads, which are drawn to the faces of the object that the human holds."""
+"""Jaws: their pads, which are drawn to the faces of the object that the human holds, and their way out of objects."""
 
 import dataclasses
 import math
 from unittest import TestCase
+from unittest.mock import patch
 
 import numpy as np
 import torch
+from numpy.testing import assert_allclose, assert_array_equal
+from torch.testing import assert_close
 
 from tests.toy_retarget import FLOAT, box_object, check_gradient, double, hand_targets
 from xreset import robots, synthesize
-from xreset.demos.archive import demo_objects
-from xreset.geometry.rotations import quat_from_axis_angle, quat_rotate
+from xreset.demos.archive import demo_objects, rest_on_table
+from xreset.geometry.collision import ObjectCollision
+from xreset.geometry.kinematics import Kinematics
+from xreset.geometry.rotations import matvec, quat_from_axis_angle, quat_rotate
 from xreset.geometry.surface import Surface
+from xreset.retarget.arm.config import ArmSearch
 from xreset.retarget.hand.config import HandWeights
 from xreset.retarget.hand.cost import system
 from xreset.retarget.hand.model import HandModel, HandState
 from xreset.retarget.hand.solve import retarget_hand
 from xreset.retarget.pipeline import HandMotions, RetargetConfig
+from xreset.retarget.push import pushed_out
+from xreset.retarget.validity import REASONS
+from xreset.retarget.verbs import retarget_demos
+from xreset.spec import KEYPOINTS
 
 UP = double([0.0, 0.0, 1.0])
 
@@ -89,3 +99,62 @@ class PadsTest(TestCase):
         [batch] = hands.batches()
         self.assertFalse(batch.targets.held[0, 0])
         self.assertTrue(batch.targets.held[0, -1])
+
+
+class PushTest(TestCase):
+    """The OpenArm, whose jaw is around objects."""
+
+    robot = robots.load("openarm")
+    kinematics = Kinematics(robot)
+
+    def plates(self, depths):
+        """States at home, and the pose of a plate 2 mm thick and 8 cm high, whose edge is in the palm between the balls
+        that fill it."""
+        joints = torch.as_tensor(self.robot.home).repeat(len(depths), 1)
+        palm = self.kinematics.link_poses(joints, ["gripper_body"])[:, 0]
+        # the palm's box ends 2 cm from its middle
+        edge = double([[0.0, 0.004, 0.02 + 0.04 - depth] for depth in depths])
+        rot = palm[:, :3, :3]
+        index = torch.zeros(len(depths), dtype=torch.long)
+        return joints, index, palm[:, :3, 3] + matvec(rot, edge), rot
+
+    def test_a_state_that_is_too_deep_is_pushed_out_and_no_other(self):
+        plate = box_object(((0, 0, 0), (0.1, 0.002, 0.08)))
+        joints, *placed = self.plates((0.0015, 0.004, 0.03))
+        collision = ObjectCollision(self.kinematics, [plate])
+        found, depth = pushed_out(self.kinematics, collision, joints, *placed, 0.002)
+        assert_close(depth, double([0.0015, 0.001, math.inf]), atol=5e-4, rtol=0)
+        poses = self.kinematics.link_poses(found, collision.links)
+        exact = collision.overlaps(poses, *placed).deepest(3)
+        assert_close(exact[:2], depth[:2])
+        self.assertGreater(exact[2], 0.02)
+        for state in (0, 2):
+            assert_close(found[state], joints[state], atol=0, rtol=0)
+        tips = [tip.link for tip in self.robot.fingertips]
+        ways = [self.kinematics.points(q, tips) for q in (joints[1], found[1])]
+        way = (ways[1] - ways[0]).norm(dim=-1)
+        self.assertTrue((way < 0.005).all(), way)
+
+    def test_frames_that_fail_by_depth_alone_are_pushed_out(self):
+        demos = synthesize(["soup"], per_object=1, seed=1)
+        objects = list(demo_objects(demos).values())
+        config = RetargetConfig(
+            hand=HandWeights(object_clearance=-0.004, tolerance=0.1),
+            arm=ArmSearch(restarts=8, branches=1),
+        )
+        given = (demos, self.robot, objects, config)
+        with patch("xreset.retarget.pipeline._push_out"):
+            before = retarget_demos(*given)
+        after = retarget_demos(*given)
+        deep = before.reason == REASONS.index("object collision")
+        self.assertGreater(deep.sum(), 10)
+        self.assertGreater(after.valid[deep].sum(), 0.8 * deep.sum())
+        self.assertTrue(after.valid[before.valid].all())
+        moved = (after.joint_pos != before.joint_pos).any(axis=1)
+        assert_array_equal(moved, deep & after.valid)
+        self.assertLessEqual(after.object_depth[after.valid].max(), 0.002)
+        tips = [KEYPOINTS.index(tip.keypoint) for tip in self.robot.fingertips]
+        human = rest_on_table(demos, objects).hand_keypoints[:, tips]
+        gap = np.linalg.norm(after.fingertip_pos - human, axis=-1).mean(axis=1)
+        assert_allclose(after.hand_error[moved], gap[moved], atol=1e-9)
+        self.assertTrue((after.hand_error[moved] != before.hand_error[moved]).all())

@@ -17,11 +17,12 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from xreset.errors import needs
+from xreset.files.checks import frozen
 from xreset.geometry.kinematics import Kinematics
-from xreset.geometry.rotations import quat_to_matrix
+from xreset.geometry.rotations import matvec, quat_to_matrix
 from xreset.geometry.shapes import transformed
 from xreset.geometry.urdf import RobotTree
-from xreset.physics.tensors import one_thread
+from xreset.physics.tensors import Tensors, one_thread
 from xreset.spec import Geometry, ObjectSpec, RobotSpec, Shape, TableSpec
 
 _RIM_POINTS = 16
@@ -201,7 +202,7 @@ class SelfCollision:
             margin: distance [m]; negative where links overlap.
         """
         shapes = self._shapes
-        distance_of = _signed_distance(shapes.coal)
+        distance_of, _ = _signed_distance(shapes.coal)
         first, second = self._pairs.T
         reach = shapes.radius[first] + shapes.radius[second] + margin
         T = link_poses[:, shapes.index]  # [B, G, 4, 4]
@@ -243,6 +244,72 @@ def _may_collide(robot: RobotSpec, tree: RobotTree, a: str, b: str) -> bool:
     return bodies not in excluded
 
 
+@frozen
+class Overlaps(Tensors):
+    """Pairs of a robot's shape and a piece of an object that overlap (length A)."""
+
+    state: Tensor
+    """[A]"""
+    shape: Tensor
+    """[A] the robot's shape."""
+    depth: Tensor
+    """[A] shortest way by which one of them must move until they are apart [m]."""
+    point: Tensor
+    """[A, 3] the robot's deepest point, in the world."""
+    outward: Tensor
+    """[A, 3] direction of the shape's way out, in the world."""
+
+    def deepest(self, states: int) -> Tensor:
+        """[M] largest depth of each of M states [m], 0 where nothing overlaps."""
+        return self.depth.new_zeros(states).scatter_reduce(0, self.state, self.depth, "amax")
+
+
+class ObjectCollision:
+    """Overlaps of a robot's shapes with the pieces of objects."""
+
+    def __init__(self, kinematics: Kinematics, objects: Sequence[ObjectSpec]) -> None:
+        """Prepare the shapes.
+
+        Raises:
+            XResetError: coal is not installed.
+        """
+        self._shapes = _LinkShapes(kinematics, kinematics.link_names)
+        self.links = tuple(self._shapes.link)
+        """Link of each of the robot's shapes (length G)."""
+        self._pieces = [_Pieces(self._shapes.coal, obj.pieces) for obj in objects]
+
+    def overlaps(
+        self, link_poses: Tensor, object_index: Tensor, object_pos: Tensor, object_rot: Tensor
+    ) -> Overlaps:
+        """Find all overlaps in states; the memory that this takes grows with their number.
+
+        Args:
+            link_poses: [M, G, 4, 4] poses of the shapes' links.
+            object_index: [M] index of the object of each state.
+            object_pos: [M, 3]
+            object_rot: [M, 3, 3]
+        """
+        T = link_poses.clone()
+        T[..., :3, 3] -= object_pos[:, None]
+        T[..., :3, :] = object_rot.mT[:, None] @ T[..., :3, :]
+        in_object = T.numpy()
+        found = []
+        for index in object_index.unique().tolist():
+            states = (object_index == index).nonzero()[:, 0].numpy()
+            found += _overlaps(self._shapes, self._pieces[index], in_object[states], states)
+        state, shape, *rest = np.array(found).reshape(-1, 9).T
+        depth, *vectors = torch.as_tensor(np.array(rest))
+        point, outward = torch.stack(vectors, dim=-1).split(3, dim=-1)
+        row = torch.as_tensor(state).long()
+        return Overlaps(
+            state=row,
+            shape=torch.as_tensor(shape).long(),
+            depth=depth,
+            point=matvec(object_rot[row], point) + object_pos[row],
+            outward=matvec(object_rot[row], outward),
+        )
+
+
 @one_thread()
 def object_depth(
     robot: RobotSpec,
@@ -272,22 +339,18 @@ def object_depth(
         XResetError: coal is not installed.
     """
     kinematics = Kinematics(robot)
-    shapes = _LinkShapes(kinematics, kinematics.link_names)
-    depth = np.zeros(len(object_name))
-    for obj in objects:
-        own = np.flatnonzero(object_name == obj.name)
-        pieces = _Pieces(shapes.coal, obj.pieces)
-        for first in range(0, len(own), _AT_ONCE):
-            rows = own[first : first + _AT_ONCE]
-            q = torch.as_tensor(joint_pos[rows], dtype=torch.float64)
-            T = kinematics.link_poses(q, shapes.link).numpy()
-            turn = quat_to_matrix(torch.as_tensor(object_quat[rows], dtype=torch.float64)).numpy()
-            # in the object's frame
-            T[..., :3, 3] -= object_pos[rows, None]
-            T[..., :3, :] = turn.swapaxes(1, 2)[:, None] @ T[..., :3, :]
-            for row, distance in _overlaps(shapes, pieces, T):
-                depth[rows[row]] = max(depth[rows[row]], -distance)
-    return depth
+    collision = ObjectCollision(kinematics, objects)
+    names = [obj.name for obj in objects]
+    index = torch.tensor([names.index(name) for name in object_name.tolist()], dtype=torch.long)
+    pos = torch.as_tensor(object_pos, dtype=torch.float64)
+    rot = quat_to_matrix(torch.as_tensor(object_quat, dtype=torch.float64))
+    joints = torch.as_tensor(joint_pos, dtype=torch.float64)
+    parts = []
+    for rows in torch.arange(len(joints)).split(_AT_ONCE):
+        poses = kinematics.link_poses(joints[rows], collision.links)
+        found = collision.overlaps(poses, index[rows], pos[rows], rot[rows])
+        parts.append(found.deepest(len(rows)).numpy())
+    return np.concatenate([np.zeros(0), *parts])
 
 
 class _Pieces:
@@ -323,10 +386,19 @@ class _Pieces:
         return rows[row], piece
 
 
-def _overlaps(shapes: _LinkShapes, pieces: _Pieces, T: np.ndarray) -> Iterator[tuple[int, float]]:
-    """Yield the state and the signed distance [m] of each pair of a link's shape and a piece that overlap, at poses
-    [M, G, 4, 4] of the shapes' links in the object's frame."""
-    distance_of = _signed_distance(shapes.coal)
+def _overlaps(
+    shapes: _LinkShapes, pieces: _Pieces, T: np.ndarray, states: np.ndarray
+) -> Iterator[tuple[float, ...]]:
+    """Yield state, shape, depth, the shape's deepest point and the direction of its way out, of each pair of a link's
+    shape and a piece that overlap.
+
+    Args:
+        shapes: the robot's shapes.
+        pieces: the object's pieces.
+        T: [B, G, 4, 4] poses of the shapes' links in the object's frame.
+        states: [B] number of each state.
+    """
+    distance_of, result = _signed_distance(shapes.coal)
     count = len(shapes.radius)
     near = pieces.near(shapes.centers(T).reshape(-1, 3), np.tile(shapes.radius, len(T)))
     before = -1
@@ -338,11 +410,19 @@ def _overlaps(shapes: _LinkShapes, pieces: _Pieces, T: np.ndarray) -> Iterator[t
             before = item
         distance = distance_of(*placed, *pieces.placed[piece])
         if distance < 0:
-            yield row, distance
+            # coal's normal points from the first shape to the second
+            yield (
+                states[row],
+                shape,
+                -distance,
+                *result.getNearestPoint1(),
+                *-result.normal,
+            )
 
 
-def _signed_distance(coal):
-    """Return a function of two placed shapes that computes their signed distance [m]."""
+def _signed_distance(coal) -> tuple:
+    """Return a function of two placed shapes that computes their signed distance [m], and where it leaves the nearest
+    points."""
     request = coal.DistanceRequest()
     request.enable_signed_distance = True
     result = coal.DistanceResult()
@@ -351,7 +431,7 @@ def _signed_distance(coal):
         result.clear()
         return coal.distance(*placed, request, result)
 
-    return distance_of
+    return distance_of, result
 
 
 def coal_geometry(coal, geometry: Geometry):

@@ -5,5 +5,6 @@
     motion.joint_pos[motion.valid]                  # robot states that may become resets
 
 Modules: ``verbs`` (the function that is a command), ``pipeline`` (the whole); ``hand`` and ``arm``, each with
-``solve``, ``cost``, ``model`` and ``config``; ``least_squares`` (the solver of both); ``validity`` and ``file``.
+``solve``, ``cost``, ``model`` and ``config``; ``least_squares`` (the solver of both); ``push`` (out of the object);
+``validity`` and ``file``.
 """

@@ -6,7 +6,7 @@ Shape letters: F frames of all sequences, S sequences of a batch padded to T fra
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -18,19 +18,20 @@ from xreset.demos.examine import human_contacts
 from xreset.files.checks import Checked, frozen
 from xreset.files.processes import batches, in_processes
 from xreset.files.progress import Progress, unseen
-from xreset.geometry.collision import object_depth
+from xreset.geometry.collision import ObjectCollision, object_depth
 from xreset.geometry.fields import DistanceFields
-from xreset.geometry.rotations import matrix_to_quat
+from xreset.geometry.rotations import matrix_to_quat, quat_to_matrix
 from xreset.geometry.surface import prepared_surface
 from xreset.physics.tensors import one_thread
 from xreset.retarget.arm.config import ArmSearch
-from xreset.retarget.arm.model import ArmModel, ArmTargets
+from xreset.retarget.arm.model import ArmModel, ArmTargets, arm_jump
 from xreset.retarget.arm.solve import track_each
 from xreset.retarget.file import Retargeted
 from xreset.retarget.hand.clearance import contact_distance
 from xreset.retarget.hand.config import HandWeights
 from xreset.retarget.hand.model import HandModel, HandState, HandTargets
 from xreset.retarget.hand.solve import retarget_hand
+from xreset.retarget.push import pushed_out
 from xreset.retarget.validity import REASONS, Thresholds, classify, too_deep
 from xreset.spec import ObjectSpec, RobotSpec, objects_named
 
@@ -69,9 +70,16 @@ def follow(
     hands = HandMotions(demos, robot, objects, config, device=device)
     demos = hands.demos
     arm = ArmModel(robot)
-    joint_pos = np.tile(robot.home, (demos.num_frames, 1))
-    reason = np.full(demos.num_frames, REASONS.index("not annotated"), dtype=np.int32)
-    hand_error, wrist_error = np.full((2, demos.num_frames), np.inf)
+    count = demos.num_frames
+    frames = _Frames(
+        joint_pos=np.tile(robot.home, (count, 1)),
+        root_pos=np.zeros((count, 3)),
+        root_quat=np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)),
+        reason=np.full(count, REASONS.index("not annotated"), dtype=np.int32),
+        hand_error=np.full(count, np.inf),
+        wrist_error=np.full(count, np.inf),
+        object_depth=np.full(count, np.inf),
+    )
     batches = list(hands.batches(lambda done, count: progress(done / 2, count)))
     paths = [_arm_targets(hands.model, arm, batch.targets, batch.motion) for batch in batches]
     followed = track_each(robot, paths, _THRESHOLDS, config.arm)
@@ -82,26 +90,29 @@ def follow(
         is_frame = batch.is_frame
         done += len(path.annotated) / 2
         progress(done, count)
-        joint_pos[rows] = arm.full(joints, path.hand_joints)[is_frame]
-        reason[rows] = classify(measures, _THRESHOLDS)[is_frame]
-        hand_error[rows] = path.hand_error[is_frame]
-        wrist_error[rows] = measures.wrist_position[is_frame]
-    hand_error[~demos.hand_valid] = np.inf
-    wrist_error[~demos.hand_valid] = np.inf
-
-    links = arm.kinematics.link_poses(torch.as_tensor(joint_pos), robot.tracked_links)
-    contact_error = hands.contact_error(arm, joint_pos)
+        frames.joint_pos[rows] = arm.full(joints, path.hand_joints)[is_frame]
+        frames.root_pos[rows] = path.root_pos[is_frame]
+        frames.root_quat[rows] = path.root_quat[is_frame]
+        frames.reason[rows] = classify(measures, _THRESHOLDS)[is_frame]
+        frames.hand_error[rows] = path.hand_error[is_frame]
+        frames.wrist_error[rows] = measures.wrist_position[is_frame]
     seen = demos.hand_valid
-    depth = np.full(demos.num_frames, np.inf)
-    depth[seen] = object_depth(
+    frames.hand_error[~seen] = np.inf
+    frames.wrist_error[~seen] = np.inf
+    frames.object_depth[seen] = object_depth(
         robot,
         objects,
         demos.object_name[demos.sequence_of_frame[seen]],
-        joint_pos[seen],
+        frames.joint_pos[seen],
         demos.object_pos[seen],
         demos.object_quat_wxyz[seen],
     )
-    reason = too_deep(reason, depth, _THRESHOLDS)
+    _push_out(frames, hands, arm)
+    reason = too_deep(frames.reason, frames.object_depth, _THRESHOLDS)
+
+    joint_pos = frames.joint_pos
+    links = arm.kinematics.link_poses(torch.as_tensor(joint_pos), robot.tracked_links)
+    contact_error = hands.contact_error(arm, joint_pos)
     contact = np.asarray(hands.touching.any(axis=1))
     goal_pos, goal_quat = demos.goal_pose
     return Retargeted(
@@ -128,11 +139,68 @@ def follow(
         reason_names=REASONS,
         contact=contact,
         first_contact=_first_contact(demos, contact),
-        hand_error=hand_error,
-        wrist_error=wrist_error,
+        hand_error=frames.hand_error,
+        wrist_error=frames.wrist_error,
         contact_error=contact_error,
-        object_depth=depth,
+        object_depth=frames.object_depth,
     )
+
+
+@dataclass
+class _Frames:
+    """The robot in all frames, and measures that decide which are valid. The arrays change in place."""
+
+    joint_pos: np.ndarray
+    """[F, J]"""
+    root_pos: np.ndarray
+    """[F, 3] target of the hand root's position."""
+    root_quat: np.ndarray
+    """[F, 4] target of its orientation."""
+    reason: np.ndarray
+    """[F] index into :data:`REASONS`, without depths in the object."""
+    hand_error: np.ndarray
+    """[F]"""
+    wrist_error: np.ndarray
+    """[F]"""
+    object_depth: np.ndarray
+    """[F]"""
+
+
+@one_thread()
+def _push_out(frames: _Frames, hands: HandMotions, arm: ArmModel) -> None:
+    """Push the robot out of the object in frames that are too deep and valid else, where this makes them valid."""
+    limit = _THRESHOLDS.object_depth
+    rows = np.flatnonzero((frames.reason == 0) & (frames.object_depth > limit))
+    demos = hands.demos
+    pos = torch.as_tensor(demos.object_pos[rows])
+    rot = quat_to_matrix(torch.as_tensor(demos.object_quat_wxyz[rows]))
+    index = torch.as_tensor(hands.object_index[demos.sequence_of_frame[rows]])
+    collision = ObjectCollision(arm.kinematics, hands.objects)
+    before = torch.as_tensor(frames.joint_pos[rows])
+    joints, depth = pushed_out(arm.kinematics, collision, before, index, pos, rot, limit)
+
+    hand_joints = joints[:, None, torch.as_tensor(arm.hand.joint_indices)]
+    root_pos = torch.as_tensor(frames.root_pos[rows])
+    root_quat = torch.as_tensor(frames.root_quat[rows])
+    targets = replace(
+        ArmTargets.of_poses(root_pos, root_quat, hand_joints),
+        hand_error=hands.fingertip_error(arm, joints, rows)[:, None],
+        hand_clearance=arm.hand_clearance(hand_joints),
+    )
+    measures = arm.problem(targets, _THRESHOLDS).measures(joints[:, None, arm.arm])
+    good = ((classify(measures, _THRESHOLDS)[:, 0] == 0) & (depth <= limit)).numpy()
+    rows = rows[good]
+    frames.joint_pos[rows] = joints[good]
+    frames.object_depth[rows] = depth[good]
+    frames.hand_error[rows] = measures.hand_error[good, 0]
+    frames.wrist_error[rows] = measures.wrist_position[good, 0]
+
+    has_next = demos.hand_valid.copy()
+    has_next[demos.frame_offsets[1:] - 1] = False
+    arm_joints = torch.as_tensor(frames.joint_pos[:, arm.robot.arm_indices])
+    jump = arm_jump(arm_joints, torch.as_tensor(has_next)).numpy()
+    jumps = (frames.reason == 0) & (jump > _THRESHOLDS.arm_jump)
+    frames.reason[jumps] = REASONS.index("arm jump")
 
 
 def _first_contact(demos: Demos, contact: np.ndarray) -> np.ndarray:
@@ -178,11 +246,12 @@ class HandMotions:
         self.model = HandModel(robot, device=device)
         """The robot's hand."""
         self._config = config
-        surfaces = {
-            name: prepared_surface(spec)
-            for name, spec in objects_named(objects, demos.object_names).items()
-        }
-        _, self._object_index = np.unique(demos.object_name, return_inverse=True)
+        named = objects_named(objects, demos.object_names)
+        surfaces = {name: prepared_surface(spec) for name, spec in named.items()}
+        self.objects = tuple(named.values())
+        """The objects of the demonstrations."""
+        _, self.object_index = np.unique(demos.object_name, return_inverse=True)
+        """[S] index of the object of each sequence."""
         self._fields = DistanceFields.join([surface.field for surface in surfaces.values()])
         self.demos = demos = rest_on_table(demos, objects)
         self._contact_points, self.touching = human_contacts(demos, surfaces)
@@ -235,6 +304,14 @@ class HandMotions:
             error[rows] = gap.cpu().numpy().mean(axis=1, where=where)
         return error
 
+    def fingertip_error(self, arm: ArmModel, joint_pos: Tensor, rows: np.ndarray) -> Tensor:
+        """[B] mean distance of the fingertips from the human's in frames ``rows`` [B], for a robot with this hand and
+        its joints [B, J] [m]."""
+        tips = np.flatnonzero(self.model.is_tip.cpu())
+        links = [self.model.keypoint_links[tip] for tip in tips]
+        human = torch.as_tensor(self._keypoints[rows][:, self.model.keypoint_indices[tips]])
+        return (arm.kinematics.points(joint_pos, links) - human).norm(dim=-1).mean(dim=-1)
+
     def _targets(
         self, sequences: np.ndarray, rows: np.ndarray, is_frame: np.ndarray
     ) -> HandTargets:
@@ -258,7 +335,7 @@ class HandMotions:
             held=padded(held),
             object_pos=padded(demos.object_pos),
             object_quat=padded(demos.object_quat_wxyz),
-            object_index=torch.as_tensor(self._object_index[sequences]),
+            object_index=torch.as_tensor(self.object_index[sequences]),
             fields=self._fields,
         )
 

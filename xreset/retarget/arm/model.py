@@ -175,6 +175,18 @@ class ArmModel:
             hand_joints.shape[:-1]
         )
 
+    def problem(
+        self, targets: ArmTargets, thresholds: Thresholds, config: ArmSearch | None = None
+    ) -> ArmProblem:
+        """Return the search for a path, with the limits of a valid frame."""
+        return ArmProblem(
+            **vars(targets),
+            model=self,
+            hand_poses=self.hand_poses(targets.hand_joints),
+            thresholds=thresholds,
+            config=config or ArmSearch(),
+        )
+
     def full(self, arm: Tensor, hand_joints: Tensor | float) -> Tensor:
         """[..., J] all joints in the robot's order, given those of the arm [..., n] and of the hand [..., J_hand]."""
         q = arm.new_zeros(*arm.shape[:-1], len(self.robot.joints))

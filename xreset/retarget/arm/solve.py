@@ -74,13 +74,7 @@ def track(
     Returns:
         Arm joints [S, T, n], and the measures [S, T] of every frame.
     """
-    problem = ArmProblem(
-        **vars(targets),
-        model=model,
-        hand_poses=model.hand_poses(targets.hand_joints),
-        thresholds=thresholds,
-        config=config or ArmSearch(),
-    )
+    problem = model.problem(targets, thresholds, config)
     forwards = branches(problem)
     joints, worth = best_path(problem, forwards)
     measures = problem.measures(joints)

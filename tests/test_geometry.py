@@ -234,6 +234,14 @@ class SelfCollisionTest(TestCase):
             self.assertEqual(configuration, 1)
             self.assertIn("right_index", a + b)
 
+    def test_any_number_of_configurations_is_looked_at(self):
+        kinematics = Kinematics(self.robot)
+        collision = SelfCollision(kinematics)
+        few = kinematics.link_poses(torch.as_tensor(self.home_and(("right_index_MCP_AA", 0.35))))
+        many = few[[0] * 600 + [1]].numpy()
+        expected = collision.clearance(few.numpy(), 0.01)
+        assert_array_equal(collision.clearance(many, 0.01), expected[[0] * 600 + [1]])
+
     def test_pairs_that_the_arm_moves_join_hand_and_arm(self):
         collision = SelfCollision(Kinematics(self.robot), moved_by_arm=True)
         self.assertIn(("forearm_link", "right_index_DP"), collision.link_pairs)

@@ -28,7 +28,7 @@ from xreset.spec import Geometry, ObjectSpec, RobotSpec, Shape, TableSpec
 _RIM_POINTS = 16
 """Support points on each rim of a cylinder."""
 _AT_ONCE = 512
-"""States whose shapes are compared with an object's at a time; limits the memory that this takes."""
+"""Configurations that are looked at together; limits the memory that this takes."""
 
 
 def support_points(shape: Shape) -> tuple[np.ndarray, float]:
@@ -135,10 +135,20 @@ class _LinkShapes:
         """[B, G, 3] centers of the balls, at poses [B, G, 4, 4] of the shapes' links."""
         return np.einsum("bgij,gj->bgi", T[..., :3, :3], self._center) + T[..., :3, 3]
 
-    def pose(self, T: np.ndarray, shape: int) -> tuple:
-        """Return a shape as coal wants it, at a pose [4, 4] of its link."""
-        T = T @ self.T_link_shape[shape]
-        return self.geometry[shape], self.coal.Transform3s(T[:3, :3], T[:3, 3])
+    def placed(self, T: np.ndarray, used: np.ndarray) -> dict[tuple[int, int], tuple]:
+        """Return shapes as coal wants them, by (configuration, shape).
+
+        Args:
+            T: [B, G, 4, 4] poses of the shapes' links.
+            used: [B, G] bool: the shapes that are wanted.
+        """
+        configuration, shape = np.nonzero(used)
+        poses = T[configuration, shape] @ self.T_link_shape[shape]
+        transform = self.coal.Transform3s
+        placed = {}
+        for b, g, pose in zip(configuration.tolist(), shape.tolist(), poses, strict=True):
+            placed[b, g] = (self.geometry[g], transform(pose[:3, :3], pose[:3, 3]))
+        return placed
 
 
 class SelfCollision:
@@ -205,21 +215,22 @@ class SelfCollision:
         distance_of, _ = _signed_distance(shapes.coal)
         first, second = self._pairs.T
         reach = shapes.radius[first] + shapes.radius[second] + margin
-        T = link_poses[:, shapes.index]  # [B, G, 4, 4]
-        centers = shapes.centers(T)
-        gap = np.linalg.norm(centers[:, first] - centers[:, second], axis=-1)
         found: dict[tuple[int, str, str], float] = {}
-        placed: dict[tuple[int, int], tuple] = {}
-        pairs = self._pairs.tolist()
-        for b, pair in np.argwhere(gap < reach).tolist():
-            i, j = pairs[pair]
-            for shape in (i, j):
-                if (b, shape) not in placed:
-                    placed[b, shape] = shapes.pose(T[b, shape], shape)
-            distance = distance_of(*placed[b, i], *placed[b, j])
-            if distance < margin:
-                key = (b, shapes.link[i], shapes.link[j])
-                found[key] = min(distance, found.get(key, margin))
+        for start in range(0, len(link_poses), _AT_ONCE):
+            T = link_poses[start : start + _AT_ONCE, shapes.index]  # [B, G, 4, 4]
+            centers = shapes.centers(T)
+            gap = np.linalg.norm(centers[:, first] - centers[:, second], axis=-1)
+            row, pair = np.nonzero(gap < reach)
+            used = np.zeros(T.shape[:2], dtype=bool)
+            used[row, first[pair]] = True
+            used[row, second[pair]] = True
+            placed = shapes.placed(T, used)
+            near = zip(row.tolist(), first[pair].tolist(), second[pair].tolist(), strict=True)
+            for b, i, j in near:
+                distance = distance_of(*placed[b, i], *placed[b, j])
+                if distance < margin:
+                    key = (start + b, shapes.link[i], shapes.link[j])
+                    found[key] = min(distance, found.get(key, margin))
         return found
 
     def clearance(self, link_poses: np.ndarray, margin: float) -> np.ndarray:
@@ -399,25 +410,17 @@ def _overlaps(
         states: [B] number of each state.
     """
     distance_of, result = _signed_distance(shapes.coal)
-    count = len(shapes.radius)
-    near = pieces.near(shapes.centers(T).reshape(-1, 3), np.tile(shapes.radius, len(T)))
-    before = -1
-    placed: tuple = ()
-    for item, piece in zip(*(indices.tolist() for indices in near), strict=True):
-        row, shape = divmod(item, count)
-        if item != before:
-            placed = shapes.pose(T[row, shape], shape)
-            before = item
-        distance = distance_of(*placed, *pieces.placed[piece])
+    near, piece = pieces.near(shapes.centers(T).reshape(-1, 3), np.tile(shapes.radius, len(T)))
+    used = np.zeros(T.shape[:2], dtype=bool)
+    used.flat[near] = True
+    placed = shapes.placed(T, used)
+    rows, own = np.divmod(near, T.shape[1])
+    for row, shape, other in zip(rows.tolist(), own.tolist(), piece.tolist(), strict=True):
+        distance = distance_of(*placed[row, shape], *pieces.placed[other])
         if distance < 0:
             # coal's normal points from the first shape to the second
-            yield (
-                states[row],
-                shape,
-                -distance,
-                *result.getNearestPoint1(),
-                *-result.normal,
-            )
+            outward = -result.normal
+            yield states[row], shape, -distance, *result.getNearestPoint1(), *outward
 
 
 def _signed_distance(coal) -> tuple:

@@ -159,19 +159,29 @@ def judged_paths(problem: ArmProblem, paths: Tensor) -> Paths:
     Only jumps depend on the frame before, and thus on the direction of a path and on splices. The other measures depend
     on the frame alone, so they are taken once.
     """
-    measures = problem.repeated(paths.shape[1]).measures(paths.flatten(0, 1))
-    no_jumps = replace(measures, arm_jump=torch.zeros_like(measures.arm_jump))
-    sound = classify(no_jumps, problem.thresholds) == 0
-    return Paths(paths, sound.view(paths.shape[:3]))
+    sound = []
+    for joints in paths.unbind(1):  # one after the other, because measures take memory
+        measures = problem.measures(joints)
+        no_jumps = replace(measures, arm_jump=torch.zeros_like(measures.arm_jump))
+        sound.append(classify(no_jumps, problem.thresholds) == 0)
+    return Paths(paths, torch.stack(sound, dim=1))
 
 
 def best_path(problem: ArmProblem, paths: Paths) -> tuple[Tensor, Tensor]:
     """Return the path [S, T, n] of the highest worth, and its worth [S]: valid frames less the cost of the detour."""
     jump = arm_jump(paths.joints, problem.annotated[:, None])
     valid = (paths.sound & (jump <= problem.thresholds.arm_jump)).sum(-1)
-    detour = (paths.joints - problem.model.home).square().sum(-1).mean(-1)
+    detour = _detour(problem, paths.joints).sum(-1)
     worth, which = (valid - problem.config.detour_cost * detour).max(dim=1)
     return paths.joints[torch.arange(len(which)), which], worth
+
+
+def _detour(problem: ArmProblem, joints: Tensor) -> Tensor:
+    """[S, K, T] squared distance from home of each annotated frame of the paths [S, K, T, n], over the number of
+    annotated frames; 0 in other frames."""
+    annotated = problem.annotated[:, None]
+    distance = (joints - problem.model.home).square().sum(-1)
+    return distance * annotated / annotated.sum(-1, keepdim=True).clamp_min(1)
 
 
 def repaired(problem: ArmProblem, known: Paths, missed: Tensor) -> Tensor:
@@ -190,14 +200,11 @@ def repaired(problem: ArmProblem, known: Paths, missed: Tensor) -> Tensor:
     known = Paths.cat((known, judged_paths(problem, new)), dim=1)
     joints = known.joints
 
-    annotated = problem.annotated
-    detour = config.detour_cost * (joints - problem.model.home).square().sum(-1)
-    detour = detour * annotated[:, None]
     return splice(
         joints,
         worth=known.sound.to(joints.dtype),
-        cost=detour / annotated.sum(1)[:, None, None],
-        annotated=annotated,
+        cost=config.detour_cost * _detour(problem, joints),
+        annotated=problem.annotated,
         jump=problem.thresholds.arm_jump,
         switch_cost=config.switch_cost,
     )

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from unittest import TestCase
+from unittest.mock import patch
 
 import numpy as np
 import trimesh
@@ -71,6 +72,18 @@ class Right(TestCase):
             errors = np.random.default_rng(0).normal(0, 0.003, demos.hand_keypoints.shape)
             noisy = replace(demos, hand_keypoints=demos.hand_keypoints + errors)
             self.assertFalse([str(found) for found in examine(noisy) if found.wrong])
+
+    def test_processes_find_the_same(self):
+        demos = synthesize(["soup", "banana"], per_object=2, seed=0)
+        objects = surfaces(demo_objects(demos))
+        raised = demos.object_pos.copy()
+        raised[demos.frames(1), 2] += 0.3
+        raised[demos.frames(3), 2] += 0.3
+        wrong = replace(demos, object_pos=raised)
+        alone = examine(wrong, objects)
+        self.assertIn(wrong.sequence_name[3], alone[0].sequences)
+        with patch("xreset.demos.examine._SMALL_BATCH", 1):
+            self.assertEqual(examine(wrong, objects), alone)
 
     def test_recorded_demonstrations(self):
         """Of 600 sequences, some objects stand on others, and one hand is never seen while its object moves."""

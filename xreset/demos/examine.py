@@ -9,7 +9,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,11 +21,16 @@ from xreset.demos.hand import ORDERS, bone_lengths
 from xreset.demos.offset import constant_offset
 from xreset.errors import DemoError
 from xreset.files.checks import frozen
+from xreset.files.processes import batches, in_processes
 from xreset.geometry.shapes import turn_of
 from xreset.geometry.surface import Surface, prepared_surface
 
 TRUST = "If the recording is right all the same, add --trust-recordings (in Python: trust=True)."
 """The one way to use what is refused."""
+_BATCH = 90
+"""Sequences that one process examines at a time, at most."""
+_SMALL_BATCH = 60
+"""Sequences up to which one batch takes less time than a second process takes to start."""
 _TOUCH = 0.020
 """A human keypoint nearer than this to the object's surface touches it [m]."""
 
@@ -143,16 +150,34 @@ def examine(
         camera: [4, 4] pose of the camera in the table frame that positions were converted with.
     """
     demos = levelled(demos)
+    jobs = []
+    for rows in batches(np.arange(len(demos)), small=_SMALL_BATCH, most=_BATCH):
+        part = demos.select(indices=rows)
+        jobs.append(_Job(part, surfaces or {}, camera))
     merged: dict[tuple[str, bool, str], Finding] = {}
-    for index, name in enumerate(demos.sequence_name.tolist()):
-        recording = _recording(demos, index, surfaces or {}, camera)
-        with np.errstate(all="ignore"):  # numbers of damaged files overflow
-            found = list(_findings(recording))
-        for finding in found:
-            key = (finding.name, finding.wrong, finding.cause)
-            first = merged.get(key, replace(finding, examined=len(demos)))
-            merged[key] = replace(first, sequences=(*first.sequences, name))
+    for name, finding in chain.from_iterable(in_processes(_named_findings, jobs)):
+        key = (finding.name, finding.wrong, finding.cause)
+        first = merged.get(key, replace(finding, examined=len(demos)))
+        merged[key] = replace(first, sequences=(*first.sequences, name))
     return sorted(merged.values(), key=lambda finding: not finding.wrong)
+
+
+class _Job(NamedTuple):
+    """The examination of some sequences; see :func:`examine`."""
+
+    demos: Demos
+    surfaces: Mapping[str, Surface]
+    camera: np.ndarray | None
+
+
+def _named_findings(job: _Job) -> list[tuple[str, Finding]]:
+    """Return what is found in each sequence, with the sequence's name."""
+    found = []
+    for index, name in enumerate(job.demos.sequence_name.tolist()):
+        recording = _recording(job.demos, index, job.surfaces, job.camera)
+        with np.errstate(all="ignore"):  # numbers of damaged files overflow
+            found += [(name, finding) for finding in _findings(recording)]
+    return found
 
 
 def surfaces_of(demos: Demos, folder: str | Path | None) -> dict[str, Surface]:

@@ -77,7 +77,7 @@ class Surface:
         self._tree = cKDTree(points[exposed])
 
         flat_nodes = nodes.reshape(-1, 3)
-        distance, _ = self._tree.query(flat_nodes)
+        distance, _ = self._tree.query(flat_nodes, workers=-1)  # on all cores
         # farther nodes keep the distance to the nearest sample
         near = distance < 2 * _GRID_SPACING + _SAMPLE_SPACING
         _, distance[near] = self.nearest(flat_nodes[near])

@@ -27,7 +27,7 @@ from xreset.geometry.surface import Surface
 from xreset.resets.fingers import fingers_of
 from xreset.retarget.arm.config import ArmSearch
 from xreset.retarget.arm.model import ArmModel
-from xreset.retarget.arm.solve import track
+from xreset.retarget.arm.solve import Paths, best_path, track
 from xreset.retarget.file import SCHEMA, Retargeted
 from xreset.retarget.hand import terms
 from xreset.retarget.hand.clearance import Objects, contact_distance, too_near
@@ -268,6 +268,27 @@ class ArmTest(TestCase):
         self.assertLess(measures.wrist_orientation.max(), 5e-3)
         self.assertEqual(reasons, ["valid"] * 8)
         self.assertTrue(((joints >= self.model.lower) & (joints <= self.model.upper)).all())
+
+    def test_frames_that_pad_a_batch_do_not_choose_the_path(self):
+        targets = self.targets(4)
+        targets = replace(targets, annotated=torch.tensor([[True, True, False, False]]))
+        problem = self.model.problem(targets, Thresholds())
+        joints = self.model.home.repeat(1, 2, 4, 1)
+        joints[:, 0, 2:] += 1.0  # nearest to home where it counts
+        joints[:, 1, :2] += 0.1
+        paths = Paths(joints, targets.annotated.expand(2, 4)[None])
+        assert_close(best_path(problem, paths)[0], joints[:, 0], atol=0, rtol=0)
+
+    def test_lags_behind_a_turn_that_would_be_a_jump(self):
+        """The last joint of the arm turns by 0.38 rad in one frame, next to a singularity others do as well."""
+        joints = self.path(1).repeat(1, 6, 1)
+        joints[:, 3:, self.model.arm[-1]] += 0.38
+        targets = arm_targets(self.model, joints)
+        for changes, expected in (({}, "valid"), ({"jump_weight": 0.0}, "arm jump")):
+            _, measures, reasons = self.track(targets, **changes)
+            self.assertEqual(reasons[3], expected)
+            self.assertEqual(reasons[:3] + reasons[4:], ["valid"] * 5)
+            self.assertLess(measures.wrist_orientation[0, 5], 0.01)
 
     def test_stays_above_the_table(self):
         heights = table_clearance(self.model.kinematics, self.path(4), self.model.table)

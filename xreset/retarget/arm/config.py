@@ -19,6 +19,11 @@ class ArmSearch:
     smoothness_weight: float = 0.02
     """Weight of the squared change of the joints since the frame before [1/rad^2]: lambda_s of the paper, which does
     not state its value."""
+    jump_limit: float = 0.34
+    """Change of a joint since the frame before beyond which ``jump_weight`` applies [rad or m] (not the paper's). Next
+    to a singularity the hand lags behind for some frames; a larger change would make the frame invalid."""
+    jump_weight: float = 20.0
+    """Weight of a joint's change since the frame before beyond ``jump_limit`` [1/rad^2]."""
     collision_weight: float = 1000.0
     """Weight of the squared depth in the margin above the table [1/m^2]."""
     table_margin: float = 0.002

@@ -1,8 +1,8 @@
 """Arm inverse kinematics: arm joints that carry a retargeted hand along its path, the hand's joints held fixed (the
 paper, appendix D.b).
 
-    q_t = argmin  50 |p(q) - p_t|^2 + 10 d_R(R(q), R_t)^2 + lambda_s |q - q_{t-1}|^2 + E_coll(q),   within the joint
-    limits,
+    q_t = argmin  50 |p(q) - p_t|^2 + 10 d_R(R(q), R_t)^2 + lambda_s |q - q_{t-1}|^2 + E_coll(q) + E_jump(q),   within
+    the joint limits,
 
 by Levenberg-Marquardt with projected steps, frame after frame, batched over sequences.
 
@@ -34,6 +34,7 @@ from xreset.geometry.rotations import (
 from xreset.physics.tensors import Tensors, one_thread
 from xreset.retarget.arm.config import ArmSearch
 from xreset.retarget.arm.model import ArmModel, ArmProblem, ArmTargets, arm_jump
+from xreset.retarget.hand import terms
 from xreset.retarget.least_squares import Quadratic, damped, free_to_move, minimize
 from xreset.retarget.validity import REASONS, Measures, Thresholds, classify
 from xreset.spec import RobotSpec
@@ -159,12 +160,12 @@ def judged_paths(problem: ArmProblem, paths: Tensor) -> Paths:
     Only jumps depend on the frame before, and thus on the direction of a path and on splices. The other measures depend
     on the frame alone, so they are taken once.
     """
-    sound = []
-    for joints in paths.unbind(1):  # one after the other, because measures take memory
-        measures = problem.measures(joints)
+    sound = torch.zeros(paths.shape[:3], dtype=torch.bool)
+    for k in range(paths.shape[1]):  # one after the other, because measures take memory
+        measures = problem.measures(paths[:, k])
         no_jumps = replace(measures, arm_jump=torch.zeros_like(measures.arm_jump))
-        sound.append(classify(no_jumps, problem.thresholds) == 0)
-    return Paths(paths, torch.stack(sound, dim=1))
+        sound[:, k] = classify(no_jumps, problem.thresholds) == 0
+    return Paths(paths, sound)
 
 
 def best_path(problem: ArmProblem, paths: Paths) -> tuple[Tensor, Tensor]:
@@ -408,10 +409,6 @@ def system(frame: ArmProblem, q: Tensor, previous: Tensor | None = None) -> Quad
         orientation_scale * rotation_error,
     ]
     jacobians = [position_scale * linear[:, 0], orientation_scale * angular[:, 0]]
-    if previous is not None:
-        scale = config.smoothness_weight**0.5
-        residuals.append(scale * (q - previous))
-        jacobians.append(scale * torch.eye(q.shape[1], dtype=q.dtype).expand(len(q), -1, -1))
     low = model.low_points(origins, rot, frame.hand_poses, config.table_margin)
     at = (low.frame, low.carrier)
     lift = linear[at] + torch.linalg.cross(angular[at], low.lever[..., None], dim=1)
@@ -419,4 +416,9 @@ def system(frame: ArmProblem, q: Tensor, previous: Tensor | None = None) -> Quad
     value = scale * (config.table_margin - low.height)
     residuals.append(q.new_zeros(linear.shape[:2]).index_put(at, value))
     jacobians.append(q.new_zeros(linear[:, :, 0].shape).index_put(at, -scale * lift[:, 2]))
-    return Quadratic.of_residuals(torch.cat(residuals, dim=1), torch.cat(jacobians, dim=1))
+    found = Quadratic.of_residuals(torch.cat(residuals, dim=1), torch.cat(jacobians, dim=1))
+    if previous is None:
+        return found
+    smoothness = q.new_full(q.shape[1:], config.smoothness_weight)
+    change = terms.change(q - previous, smoothness, config.jump_limit, config.jump_weight)
+    return found + replace(change, curvature=torch.diag_embed(change.curvature))

@@ -97,7 +97,7 @@ def attraction(distance: Tensor, weight: Tensor, reach: float) -> Quadratic:
     return Quadratic(cost.sum(-1), pull * distance, pull)
 
 
-def change(d: Tensor, weight: Tensor, limit: Tensor, excess_weight: float) -> Quadratic:
+def change(d: Tensor, weight: Tensor, limit: Tensor | float, excess_weight: float) -> Quadratic:
     """Change of variables between neighboring frames: E = w d^2 + W [|d| - limit]_+^2.
 
     The first part is the paper's smoothness. The second is a wall against jumps, for which the first is too soft.

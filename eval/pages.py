@@ -16,9 +16,9 @@ def cell(text: str) -> str:
     return " ".join(text.replace("|", "\\|").split())
 
 
-def percent(share: float, digits: int = 0) -> str:
+def percent(share: float) -> str:
     """Return a share as percent: ``0.345`` is ``34%``."""
-    return f"{share:.{digits}%}"
+    return f"{share:.0%}"
 
 
 @cache

@@ -12,7 +12,6 @@ from collections import Counter
 
 from xreset.eval.results import Rollouts
 from xreset.eval.rollout import Engine, Round, Trial, play_rounds
-from xreset.files.progress import Progress, unseen
 from xreset.live.engine import begin_episodes
 from xreset.live.faults import Faults, FaultyDriver
 from xreset.runtime import Controller, Runner
@@ -32,7 +31,6 @@ def roll_out_on_robot(
     faults: Faults,
     *,
     episodes: int,
-    progress: Progress = unseen,
 ) -> Rollouts:
     """Play demonstrations ``episodes`` times each through the loop. Nothing is recorded.
 
@@ -42,7 +40,6 @@ def roll_out_on_robot(
         trial: what is played.
         faults: faults of every robot.
         episodes: episodes of each demonstration.
-        progress: called with (rounds done, rounds in all).
     """
     stopped: Counter[str] = Counter()
     steps = 0
@@ -63,7 +60,6 @@ def roll_out_on_robot(
             if reason is not None:
                 stopped[re.sub(r"-?\d+\.\d+", "...", reason)] += 1
         steps += env.max_episode_length * env.num_envs
-        progress(played.number + 1, played.total)
 
     return Rollouts(
         episodes=play_rounds(engine, trial, episodes, play),

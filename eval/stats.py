@@ -132,16 +132,16 @@ def difference_p(one: Sequence[np.ndarray], other: Sequence[np.ndarray]) -> floa
     return min(1.0, 2 * float(fewer + 1) / (DRAWS + 1))
 
 
-def holm(p_values: Sequence[float], level: float = 0.05) -> list[bool]:
-    """Return which of several differences are certain, if the chance that any of them is claimed wrongly may be
-    ``level`` (Holm, Scandinavian Journal of Statistics 6, 1979).
+def holm(p_values: Sequence[float]) -> list[bool]:
+    """Return which of several differences are certain, if the chance that any of them is claimed wrongly may be 5 %
+    (Holm, Scandinavian Journal of Statistics 6, 1979).
 
-    Of m p values, the smallest is compared with level / m, the next one with level / (m - 1), and so on up to the first
+    Of m p values, the smallest is compared with 0.05 / m, the next one with 0.05 / (m - 1), and so on up to the first
     that is too large.
     """
     certain = [False] * len(p_values)
     for place, index in enumerate(np.argsort(p_values, kind="stable")):
-        if p_values[index] > level / (len(p_values) - place):
+        if p_values[index] > 0.05 / (len(p_values) - place):
             break
         certain[index] = True
     return certain

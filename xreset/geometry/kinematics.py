@@ -309,8 +309,6 @@ class Kinematics:
         q: Tensor,
         links: Sequence[str],
         offsets: Tensor | None = None,
-        *,
-        base: Tensor | None = None,
     ) -> PointJacobian:
         """Compute points on links and their geometric Jacobian; arguments as in :meth:`points`.
 
@@ -318,7 +316,7 @@ class Kinematics:
         joint adds to the column of its source, times its multiplier (chain rule).
         """
         indices = [self.link_index(name) for name in links]
-        rot, pos, axes, origins = self._forward(q, base, indices)
+        rot, pos, axes, origins = self._forward(q, None, indices)
         shape = (*q.shape[:-1], len(indices))
         if offsets is not None:
             given: Any = self._library.broadcast_to(offsets, (*shape, 3)).reshape(pos.shape)

@@ -198,28 +198,20 @@ def resume(
 def config_of_student(
     teacher: str | Path,
     cameras: str | CameraConfig | Sequence[str | CameraConfig] = "front",
-    vision: VisionConfig | None = None,
 ) -> TrainConfig:
     """Return the configuration of a student of a teacher.
 
     Args:
         teacher: as for :func:`xreset.train`.
         cameras: name of one of :data:`xreset.cameras.config.CAMERAS`, or a camera; or several.
-        vision: images, their timing and what the student gets of them; its cameras are replaced by ``cameras``.
-            Default: points, and the object at its goal.
 
     Raises:
         PolicyError: the teacher is unknown.
-        XResetError: a camera is unknown, or the images have fewer pixels than points.
+        XResetError: a camera is unknown.
     """
     wanted = [cameras] if isinstance(cameras, str | CameraConfig) else cameras
     chosen = tuple(_camera(each) for each in wanted)
-    try:
-        vision = replace(vision or STUDENT_VISION, cameras=chosen)
-    except ValueError as error:
-        raise XResetError(
-            f"vision.{error}. Give fewer points, or a larger width and height."
-        ) from None
+    vision = replace(STUDENT_VISION, cameras=chosen)
     return student_config(read_policy(teacher).contract.task, vision)
 
 

@@ -21,26 +21,26 @@ _PROBE = 2e-4
 """Distance from the surface at which a sample is tested [m]: above rounding, below any feature."""
 
 
-def surface_points(obj: ObjectSpec, count: int = 64, seed: int = 0) -> np.ndarray:
-    """[count, 3] well spread points of the object's outer surface; the same seed gives the same points.
+def surface_points(obj: ObjectSpec, count: int = 64) -> np.ndarray:
+    """[count, 3] well spread points of the object's outer surface, always the same.
 
     Uniform samples by area, without those inside the solid (where pieces of a stand-in overlap), thinned by
     farthest-point selection. Found once for each surface in a process.
     """
     surface = blake2b(obj.vertices.tobytes() + obj.faces.tobytes()).digest()
-    key = (surface, count, seed)
+    key = (surface, count)
     if key not in _SURFACE_POINTS:
-        _SURFACE_POINTS[key] = _spread_points(obj, count, seed)
+        _SURFACE_POINTS[key] = _spread_points(obj, count)
     return _SURFACE_POINTS[key].copy()
 
 
-_SURFACE_POINTS: dict[tuple[bytes, int, int], np.ndarray] = {}
-"""Points that :func:`surface_points` has found, by surface, count and seed."""
+_SURFACE_POINTS: dict[tuple[bytes, int], np.ndarray] = {}
+"""Points that :func:`surface_points` has found, by surface and count."""
 
 
-def _spread_points(obj: ObjectSpec, count: int, seed: int) -> np.ndarray:
+def _spread_points(obj: ObjectSpec, count: int) -> np.ndarray:
     points, _, normals = sample_surface(
-        obj.vertices, obj.faces, max(_CANDIDATES_PER_POINT * count, 256), seed
+        obj.vertices, obj.faces, max(_CANDIDATES_PER_POINT * count, 256), seed=0
     )
     outside = winding_number(points + _PROBE * normals, obj.vertices, obj.faces) < 0.5
     return farthest_points(points[outside], count)

@@ -1,5 +1,10 @@
 """The lift clock: when success from home first passed its marks, over restarts too. Curves that are sent elsewhere."""
 
+import errno
+import io
+import os
+import threading
+from contextlib import redirect_stderr
 from unittest import mock
 
 import torch
@@ -89,6 +94,25 @@ class CurvesTest(InFolder):
             self.assertEqual(found, (iteration, 1.0, 0.0 if share else 0.5))
             self.assertEqual({p.iteration for p in curves.lift.passed}, set() if share else {2})
         curves.close()
+
+    def test_a_full_disk_is_said_in_one_message(self):
+        said = io.StringIO()
+        full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        curves = TrainingLog(self.folder, 2, "cpu", None)
+        write = "tensorboard.summary.writer.record_writer.RecordWriter.write"
+        with (
+            mock.patch(write, side_effect=full),
+            redirect_stderr(said),
+            self.assertRaisesRegex(
+                XResetError, "learning curves into .*No space left.*same command"
+            ),
+        ):
+            for iteration in range(100):
+                curves.add(torch.ones(2), torch.zeros(2), LOG)
+                curves.write(iteration, 10, 60.0, {"speed/env_steps_per_second": 2.0})
+        self.assertEqual(said.getvalue(), "")
+        self.assertRaises(XResetError, curves.close)
+        self.assertIs(threading.excepthook, threading.__excepthook__)
 
     def test_curves_are_sent_only_if_a_project_is_named(self):
         online = mock.Mock()

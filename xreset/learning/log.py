@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import os
+import threading
 import time
 from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from xreset.errors import needs
+from xreset.errors import XResetError, needs
 from xreset.files.storage import read_json
 from xreset.learning.clock import Lift, read_lift, write_lift
 
@@ -64,7 +69,10 @@ class TrainingLog:
         self._folder = folder
         self.lift = read_lift(folder).up_to(done) if done else Lift()
         """The last iteration's success from home is 0 as long as a teacher acts in some worlds."""
-        self._curves = SummaryWriter(str(folder))
+        self._thread_hook = threading.excepthook
+        threading.excepthook = partial(_except_writer, self._thread_hook)
+        with self._written():
+            self._curves = SummaryWriter(str(folder))
         self._returns = torch.zeros(num_envs, device=device)
         self._lengths = torch.zeros(num_envs, device=device)
         # sum of returns, sum of lengths, number of episodes
@@ -110,8 +118,9 @@ class TrainingLog:
         curves = means | scalars
         if episodes:
             curves |= {"episode/return": returns / episodes, "episode/length": lengths / episodes}
-        for tag, value in curves.items():
-            self._curves.add_scalar(tag, value, iteration)
+        with self._written():
+            for tag, value in curves.items():
+                self._curves.add_scalar(tag, value, iteration)
         if self._online is not None:
             self._online.log(curves, step=iteration)
         from_home = means["task/success_from_home"]
@@ -145,7 +154,28 @@ class TrainingLog:
     def close(self) -> None:
         """Print the last line, and end the files."""
         self._print_line()
-        self._curves.close()
+        try:
+            with self._written():
+                self._curves.close()
+        finally:
+            threading.excepthook = self._thread_hook
         if self._online is not None:
             self._online.finish()
         self.write_lift()
+
+    @contextmanager
+    def _written(self) -> Iterator[None]:
+        """Say which files cannot be written, and what to do."""
+        try:
+            yield
+        except OSError as error:
+            raise XResetError(
+                f"cannot write the learning curves into {self._folder}: {error.strerror or error}. The newest"
+                " checkpoint is as it was. Free some space, and give the same command again."
+            ) from error
+
+
+def _except_writer(hook: Callable[[Any], Any], failed: Any) -> None:
+    """Hand errors of threads on, except those of TensorBoard's writer, which raises them in the main thread again."""
+    if type(failed.thread).__name__ != "_AsyncWriterThread":
+        hook(failed)

@@ -81,6 +81,9 @@ _TYPES |= {"quat": wp.quat, "object_quat": wp.quat, "invweight": wp.vec2}
 _SOLVER_ITERATIONS = 8
 """Most Newton iterations; worlds that have converged stop earlier, but a step waits for the slowest. With 8 the
 conformance checks give the same results as with 30, at 240 and at 120 Hz."""
+_MANY_WORLDS = 256
+"""Worlds of which one always takes all iterations: a tenth of the worlds do. To ask after each iteration whether all
+worlds have converged then costs 1.4 % of a step and never ends it early."""
 _OVERFLOW = int(
     mjw.OverflowType.NEFC
     | mjw.OverflowType.NJMAX_NNZ
@@ -142,6 +145,7 @@ class MujocoWarpBackend(BatchBackend):
                 self._model: Any = mjw.put_model(at.model, batch_sizes=batched)
                 # Overflows are counted, see health(); printing them from the GPU would flood the terminal.
                 self._model.opt.warn_overflow = 0
+                self._model.opt.graph_conditional = num_worlds < _MANY_WORLDS
                 self._data: Any = mjw.make_data(
                     at.model, nworld=num_worlds, nconmax=contacts, nccdmax=convex, njmax=rows
                 )

@@ -2,18 +2,19 @@
 
 import gc
 import weakref
+from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 from itertools import product
 from unittest import TestCase, skipIf
-from unittest.mock import patch
+from unittest.mock import Mock, patch
 
 import mujoco
 import mujoco_warp
 import numpy as np
 import torch
 import warp as wp
-from mujoco_warp._src import constraint
+from mujoco_warp._src import constraint, solver
 from numpy.testing import assert_allclose, assert_array_equal
 from torch import tensor
 from torch.testing import assert_close
@@ -30,6 +31,7 @@ from xreset.backends.mujoco import MujocoBackend, MujocoWorld
 from xreset.backends.mujoco_warp import MujocoWarpBackend
 from xreset.backends.mujoco_warp_setup import compile_kernels, contact_room, differing_fields
 from xreset.backends.mujoco_warp_step import (
+    HESSIAN_WAVES,
     constraints,
     finish,
     forked_step,
@@ -289,6 +291,45 @@ class Steps(TestCase):
         for other in results[1:]:
             for a, b in zip(results[0], other, strict=True):
                 assert_close(a, b, rtol=0, atol=0)
+
+    def test_a_step_with_all_iterations_is_the_one_that_ends_early(self):
+        results = []
+        for many in (1, 9):
+            with (
+                patch.object(mujoco_warp_backend, "_MANY_WORLDS", many),
+                MujocoWarpBackend(scene(), 8) as backend,
+            ):
+                target = backend.state().joint_target.clone()
+                for further in torch.linspace(0.0, 0.3, 20):
+                    backend.set_joint_targets(target + further)
+                    backend.step(2)
+                self.assertEqual(backend._model.opt.graph_conditional, many == 9)
+                results.append(everything(backend))
+        for a, b in zip(*results, strict=True):
+            assert_close(a, b, rtol=0, atol=0)
+
+    def test_a_gpu_adds_contacts_in_more_blocks(self):
+        """Streams of a GPU are replaced here: the CPU has none."""
+        main = Mock()
+        second = Mock()
+        waves = []
+
+        def solve(m, d):
+            second.wait_stream.assert_called_once_with(main)
+            main.wait_stream.assert_called_once_with(second)
+            waves.append(solver._JTDAJ_OVERSUBSCRIBE_WAVES)
+
+        engine = solver._JTDAJ_OVERSUBSCRIBE_WAVES
+        with (
+            MujocoWarpBackend(scene(), 1) as backend,
+            patch.object(wp, "get_stream", return_value=main),
+            patch.object(wp, "ScopedStream", lambda *_, **__: nullcontext()),
+            patch.object(mujoco_warp, "solve", solve),
+        ):
+            for stream in (second, None):
+                forked_step(stream, backend._model, backend._data)
+        self.assertEqual(waves, [HESSIAN_WAVES, engine])
+        self.assertGreater(HESSIAN_WAVES, engine)
 
 
 class Kernels(TestCase):

@@ -181,6 +181,7 @@ class Synthetic(InFolder):
         still = time + (np.arange(frames) > 0)
         found = read_keypoints(self.npz(time=still), replace(PLAIN, fps=30.0))
         self.assertEqual(found.num_frames, 3 * (frames + 9) + 3)
+        self.assertEqual(np.flatnonzero(~found.hand_valid).tolist(), [*range(1, 33)])
         time[-1] = 2e8
         self.refused("more than 100000 frames", replace(PLAIN, fps=30.0), time=time)
 

@@ -42,7 +42,7 @@ _KNUCKLES = [0, 5, 9, 13, 17]
 _UNEVEN = 0.1
 """Largest relative deviation of a time step from the median one for frames that count as evenly spaced."""
 _GAP = 0.3
-"""Longest time between two frames over which a moving object is interpolated [s]."""
+"""Longest time between two frames over which the hand and a moving object are interpolated [s]."""
 _GAP_MOTION = 0.02
 """An object that moves farther in such a time moves [m]."""
 _USUAL_RATES = (24 / 1.001, 30 / 1.001, 60 / 1.001, 120 / 1.001)
@@ -417,6 +417,11 @@ def _evenly(arrays: Arrays, convention: Convention, motion: Motion) -> tuple[flo
     rate = convention.fps or own
     if even and abs(rate / own - 1) < 1e-3:
         return rate, motion
+    return rate, _resampled(time, rate, motion)
+
+
+def _resampled(time: np.ndarray, rate: float, motion: Motion) -> Motion:
+    """Return the motion at a rate, interpolated between its times [F]. In a gap the hand counts as not seen."""
     frames = (time[-1] - time[0]) * rate + 1e-6
     if frames > MAX_FRAMES:
         raise DemoError(
@@ -425,24 +430,21 @@ def _evenly(arrays: Arrays, convention: Convention, motion: Motion) -> tuple[flo
         )
     at = np.minimum(time[0] + np.arange(int(frames) + 1) / rate, time[-1])
     points, pos, turn = motion
-    gap = _gap(time, pos)
-    if gap is not None:
+    steps = np.diff(time)
+    is_gap = steps > max(_GAP, 3 * float(np.median(steps)))
+    moves = np.linalg.norm(np.diff(pos, axis=0), axis=1)
+    lost = is_gap & (moves > _GAP_MOTION)
+    if lost.any():
+        gap = int(np.argmax(lost))
         raise DemoError(
             f"nothing is known for {steps[gap]:.2f} s after frame {gap}, in which the object moves by"
-            f" {length_text(float(np.linalg.norm(pos[gap + 1] - pos[gap])))}. Give the frames before and after as two"
-            " sequences."
+            f" {length_text(moves[gap])}. Give the frames before and after as two sequences."
         )
     # keypoints next to a frame without a hand become NaN
     points, pos = (interp1d(time, values, axis=0)(at) for values in (points, pos))
-    return rate, (points, pos, Slerp(time, turn)(at))
-
-
-def _gap(time: np.ndarray, pos: np.ndarray) -> int | None:
-    """Return the frame [F] after which times [s] have a gap in which the object moves, or None."""
-    steps = np.diff(time)
-    moves = np.linalg.norm(np.diff(pos, axis=0), axis=1) > _GAP_MOTION
-    gaps = (steps > max(_GAP, 3 * float(np.median(steps)))) & moves
-    return int(np.argmax(gaps)) if gaps.any() else None
+    before = np.searchsorted(time, at).clip(1) - 1
+    points[is_gap[before] & (at > time[before]) & (at < time[before + 1])] = np.nan
+    return points, pos, Slerp(time, turn)(at)
 
 
 def _rate(time: np.ndarray) -> float:

@@ -178,6 +178,17 @@ class UsageTest(TestCase):
                 for each in told:
                     self.assertIn(each, err)
 
+    def test_flags_that_are_gone_say_what_is_done_now(self):
+        for words, told in (
+            ("eval zero --demos none --settle", "--settle is gone: episodes begin as recorded"),
+            ("resets none --out b.npz --squeeze.weight 0", "press with --squeeze.force and the"),
+            ("resets none --out b.npz --squeeze.reach=0.1", "--squeeze.reach is gone: fingers"),
+        ):
+            with self.subTest(words):
+                code, _, err = run(*words.split())
+                self.assertEqual(code, 2)
+                self.assertIn(told, err)
+
     def test_help_of_training_is_short_and_fits_a_terminal(self):
         with patch.dict(os.environ, COLUMNS="80"):
             words = run("train", "--help")[1]

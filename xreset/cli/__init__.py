@@ -118,6 +118,15 @@ _NEEDLESS = {
     "--resume": "a training continues with --out RUN alone, or with its whole command",
 }
 """Flag of earlier versions -> why it is not needed."""
+_SQUEEZE = "fingers press with --squeeze.force and the object's weight, in balance; 0: none presses"
+_GONE_FLAGS = {
+    "--settle": "episodes begin as recorded, because starts at rest gained nothing",
+    "--squeeze.weight": _SQUEEZE,
+    "--squeeze.balanced": _SQUEEZE,
+    "--squeeze.no-balanced": _SQUEEZE,
+    "--squeeze.reach": _SQUEEZE,
+}
+"""Flag of earlier versions -> what is done now."""
 _NAME_OBJECTS = (["demos", "synth"], ["demos", "select"])
 """Commands whose ``--objects`` are names of objects, and always were."""
 
@@ -148,6 +157,9 @@ def _with_present_flags(argv: list[str]) -> list[str]:
             used[flag] = changed[flag]
         if flag.startswith("--vision."):
             changed[flag] = f"--config.task.{flag[2:]}"
+        if flag in _GONE_FLAGS:
+            print(f"xreset: {flag} is gone: {_GONE_FLAGS[flag]}.", file=sys.stderr)
+            raise SystemExit(2)
         if flag in _NEEDLESS:
             print(f"xreset: {flag} is gone: {_NEEDLESS[flag]}.", file=sys.stderr)
         else:

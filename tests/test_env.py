@@ -153,6 +153,8 @@ class RefusalTest(WithEnv):
         ):
             with refuses(self, words, XResetError):
                 make_env(*parts, num_envs=1)
+        with refuses(self, "num_envs is 0, expected a whole number above 0", XResetError):
+            make_env(robot, objects, bank, num_envs=0)
         motion = toy_retargeted(robot, [SOUP], [0, 2], joint_names=names)
         with self.assertRaisesRegex(XResetError, "is a retargeted file for the robot"):
             make_bank(motion, robot, objects)

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from xreset.errors import XResetError
-from xreset.files.checks import Seed, obeys_rules
+from xreset.files.checks import PositiveInt, Seed, obeys_rules
 from xreset.files.text import shown
 from xreset.geometry.rotations import quat_rotate, quat_rotate_inverse
 from xreset.objects.sampling import center, metric_points, surface_points
@@ -65,7 +65,7 @@ def make_env(
     task: TaskConfig = TASK,
     *,
     engine: str = "mujoco",
-    num_envs: int = 16,
+    num_envs: PositiveInt = 16,
     device: str = "cpu",
     seed: Seed = 0,
 ) -> ManipulationEnv:

@@ -98,6 +98,7 @@ class CurvesTest(InFolder):
     def test_a_full_disk_is_said_in_one_message(self):
         said = io.StringIO()
         full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        hook = threading.excepthook
         curves = TrainingLog(self.folder, 2, "cpu", None)
         write = "tensorboard.summary.writer.record_writer.RecordWriter.write"
         with (
@@ -112,7 +113,7 @@ class CurvesTest(InFolder):
                 curves.write(iteration, 10, 60.0, {"speed/env_steps_per_second": 2.0})
         self.assertEqual(said.getvalue(), "")
         self.assertRaises(XResetError, curves.close)
-        self.assertIs(threading.excepthook, threading.__excepthook__)
+        self.assertIs(threading.excepthook, hook)
 
     def test_curves_are_sent_only_if_a_project_is_named(self):
         online = mock.Mock()

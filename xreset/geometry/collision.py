@@ -420,7 +420,7 @@ def _overlaps(
         if distance < 0:
             # coal's normal points from the first shape to the second
             outward = -result.normal
-            yield states[row], shape, -distance, *result.getNearestPoint1(), *outward
+            yield int(states[row]), shape, -distance, *result.getNearestPoint1(), *outward
 
 
 def _signed_distance(coal) -> tuple:

@@ -168,7 +168,7 @@ class _Frames:
 
 @one_thread()
 def _push_out(frames: _Frames, hands: HandMotions, arm: ArmModel) -> None:
-    """Push the robot out of the object in frames that are too deep and valid else, where this makes them valid."""
+    """Push the robot out of the object in frames that are too deep and otherwise valid, where this makes them valid."""
     limit = _THRESHOLDS.object_depth
     rows = np.flatnonzero((frames.reason == 0) & (frames.object_depth > limit))
     demos = hands.demos

@@ -64,6 +64,7 @@ def run(options: Options, console: Console) -> None:
             shape = (env.num_envs, env.num_actions)
             env.step(_NOISE * torch.randn(shape, device=env.device, generator=generator))
         backend: Any = env.backend
+        wp.synchronize_device(backend._warp_device)
         with wp.ScopedStream(wp.Stream() if backend._warp_device.is_cuda else None):
             _print_stages(backend, console)
             if backend._warp_device.is_cuda:
@@ -105,7 +106,6 @@ def _print_stages(backend: Any, console: Console) -> None:
 
         return seconds_of(launch)
 
-    wp.synchronize_device(device)
     times = defaultdict(list)
     for _ in range(_STEPS):
         for name, graph in graphs.items():

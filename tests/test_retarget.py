@@ -35,7 +35,7 @@ from xreset.retarget.hand.config import HandWeights
 from xreset.retarget.hand.cost import system
 from xreset.retarget.hand.model import HandModel, keypoint_pairs
 from xreset.retarget.hand.solve import retarget_hand
-from xreset.retarget.least_squares import solve_chain
+from xreset.retarget.least_squares import change_cost, solve_chain
 from xreset.retarget.pipeline import RetargetConfig
 from xreset.retarget.validity import REASONS, Measures, Thresholds, classify, too_deep
 from xreset.retarget.verbs import retarget_demos
@@ -72,7 +72,7 @@ class TermTest(TestCase):
         limit = double([0.2, 0.2, torch.inf])
         weight = double([2.0, 3.0, 4.0])
         d = double([[0.1, -0.3, 0.5]])
-        found = terms.change(d, weight, limit, 100.0)
+        found = change_cost(d, weight, limit, 100.0)
         assert_close(found.curvature, double([[2.0, 103.0, 4.0]]))
         assert_close(found.gradient, double([[0.2, -10.9, 2.0]]))
         self.assertAlmostEqual(found.cost.item(), 2 * 0.01 + 3 * 0.09 + 4 * 0.25 + 100 * 0.01)

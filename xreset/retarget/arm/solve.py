@@ -34,8 +34,7 @@ from xreset.geometry.rotations import (
 from xreset.physics.tensors import Tensors, one_thread
 from xreset.retarget.arm.config import ArmSearch
 from xreset.retarget.arm.model import ArmModel, ArmProblem, ArmTargets, arm_jump
-from xreset.retarget.hand import terms
-from xreset.retarget.least_squares import Quadratic, damped, free_to_move, minimize
+from xreset.retarget.least_squares import Quadratic, change_cost, damped, free_to_move, minimize
 from xreset.retarget.validity import REASONS, Measures, Thresholds, classify
 from xreset.spec import RobotSpec
 
@@ -420,5 +419,5 @@ def system(frame: ArmProblem, q: Tensor, previous: Tensor | None = None) -> Quad
     if previous is None:
         return found
     smoothness = q.new_full(q.shape[1:], config.smoothness_weight)
-    change = terms.change(q - previous, smoothness, config.jump_limit, config.jump_weight)
+    change = change_cost(q - previous, smoothness, config.jump_limit, config.jump_weight)
     return found + replace(change, curvature=torch.diag_embed(change.curvature))

@@ -25,7 +25,7 @@ from xreset.retarget.hand import terms
 from xreset.retarget.hand.clearance import Distances, Objects, pad_distances, too_near
 from xreset.retarget.hand.config import HandWeights
 from xreset.retarget.hand.model import Bodies, HandModel, HandState, HandTargets
-from xreset.retarget.least_squares import Quadratic
+from xreset.retarget.least_squares import Quadratic, change_cost
 
 _FRAMES_PER_CHUNK = {"cpu": 256, "cuda": 2048}
 """On a CPU, as many frames as fit its caches; on a GPU, enough frames to fill it."""
@@ -60,7 +60,7 @@ def system(
     weight[joints : joints + 3] /= config.length_scale**2
     limit = torch.full_like(weight, float("inf"))
     limit[:joints] = config.jump_limit
-    change = terms.change(changes, weight, limit, config.jump_weight)
+    change = change_cost(changes, weight, limit, config.jump_weight)
     diagonal = single.curvature.diagonal(dim1=-2, dim2=-1)
     diagonal[:, 1:] += change.curvature
     diagonal[:, :-1] += change.curvature

@@ -95,23 +95,3 @@ def attraction(distance: Tensor, weight: Tensor, reach: float) -> Quadratic:
     pull = weight * left.square()
     cost = weight * reach**2 / 3.0 * (1.0 - left**3)
     return Quadratic(cost.sum(-1), pull * distance, pull)
-
-
-def change(d: Tensor, weight: Tensor, limit: Tensor | float, excess_weight: float) -> Quadratic:
-    """Change of variables between neighboring frames: E = w d^2 + W [|d| - limit]_+^2.
-
-    The first part is the paper's smoothness. The second is a wall against jumps, for which the first is too soft.
-
-    Args:
-        d: [..., n] changes.
-        weight: [n] w.
-        limit: [n] largest change without further cost; infinite where there is none.
-        excess_weight: W.
-
-    Returns:
-        Cost [...], half the gradient [..., n] and half the Gauss-Newton Hessian's diagonal [..., n].
-    """
-    excess = (d.abs() - limit).clamp_min(0.0)
-    cost = (weight * d.square() + excess_weight * excess.square()).sum(-1)
-    gradient = weight * d + excess_weight * excess * d.sign()
-    return Quadratic(cost, gradient, weight + excess_weight * (excess > 0))

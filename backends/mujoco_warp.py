@@ -82,8 +82,8 @@ _SOLVER_ITERATIONS = 8
 """Most Newton iterations; worlds that have converged stop earlier, but a step waits for the slowest. With 8 the
 conformance checks give the same results as with 30, at 240 and at 120 Hz."""
 _MANY_WORLDS = 256
-"""Worlds of which one always takes all iterations: a tenth of the worlds do. To ask after each iteration whether all
-worlds have converged then costs 1.4 % of a step and never ends it early."""
+"""Number of worlds from which on one world always takes all iterations, because a tenth of all worlds do. Then the
+question whether all worlds have converged, after each iteration, costs 1.4 % of a step and never ends it early."""
 _OVERFLOW = int(
     mjw.OverflowType.NEFC
     | mjw.OverflowType.NJMAX_NNZ

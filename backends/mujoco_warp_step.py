@@ -67,6 +67,11 @@ def finish(m: Any, d: Any) -> None:
     mjw.implicit(m, d)
 
 
+def more_blocks() -> Any:
+    """Return a context in which the solver's matrix gets :data:`HESSIAN_WAVES`."""
+    return patch.object(solver, "_JTDAJ_OVERSUBSCRIBE_WAVES", HESSIAN_WAVES)
+
+
 def forked_step(second: wp.Stream | None, m: Any, d: Any) -> None:
     """Queue ``mujoco_warp.step`` after its kinematics, which must be there, on Warp's current stream and a second one.
 
@@ -86,5 +91,5 @@ def forked_step(second: wp.Stream | None, m: Any, d: Any) -> None:
             smooth_dynamics(m, d)
         constraints(m, d)
         main.wait_stream(second)
-        with patch.object(solver, "_JTDAJ_OVERSUBSCRIBE_WAVES", HESSIAN_WAVES):
+        with more_blocks():
             finish(m, d)

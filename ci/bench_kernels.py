@@ -13,18 +13,16 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import Any
-from unittest.mock import patch
 
 import mujoco_warp as mjw
 import numpy as np
 import torch
 import warp as wp
 from benchlib import Options, seconds_of
-from mujoco_warp._src import solver
 from rich.console import Console
 from rich.table import Table
 
-from xreset.backends import mujoco_warp_step as fork
+from xreset.backends import mujoco_warp_step
 from xreset.env.manipulation import make_env
 from xreset.learning.config import TrainConfig
 from xreset.resets.inputs import load_inputs
@@ -77,39 +75,35 @@ def _stages(backend: Any) -> Stages:
     m = backend._model
     d = backend._data
 
+    def make_rows() -> None:
+        mjw.make_constraint(m, d)
+        mujoco_warp_step.keep_contacts(d)
+
     def solve() -> None:
-        with patch.object(solver, "_JTDAJ_OVERSUBSCRIBE_WAVES", fork.HESSIAN_WAVES):
+        with mujoco_warp_step.more_blocks():
             mjw.solve(m, d)
 
     return {
         "kinematics": partial(mjw.fwd_kinematics, m, d),
-        "free motion": partial(fork.smooth_dynamics, m, d),
+        "free motion": partial(mujoco_warp_step.smooth_dynamics, m, d),
         "collisions": partial(mjw.collision, m, d),
-        "rows of constraints": partial(mjw.make_constraint, m, d),
+        "rows of constraints": make_rows,
         "solver": solve,
         "integration": partial(mjw.implicit, m, d),
     }
 
 
 def _print_stages(backend: Any, console: Console) -> None:
-    device = backend._warp_device
-    graphs = {}
+    launches = {}
     for name, stage in _stages(backend).items():
-        with wp.ScopedCapture(device=device) as capture:
+        with wp.ScopedCapture(device=backend._warp_device) as capture:
             stage()
-        graphs[name] = capture.graph
-
-    def timed(graph: Any) -> float:
-        def launch() -> None:
-            wp.capture_launch(graph)
-            wp.synchronize_device(device)
-
-        return seconds_of(launch)
-
+        graph: Any = capture.graph
+        launches[name] = partial(wp.capture_launch, graph)
     times = defaultdict(list)
     for _ in range(_STEPS):
-        for name, graph in graphs.items():
-            times[name].append(timed(graph))
+        for name, launch in launches.items():
+            times[name].append(seconds_of(launch, str(backend.device)))
     found = {name: 1e6 * float(np.median(values)) for name, values in times.items()}
     _print_shares("stage", found, console)
 

@@ -25,7 +25,7 @@ _AIM = 0.5 * Thresholds().object_depth
 _STEPS = 10
 """Largest number of steps."""
 _LONGEST_STEP = 2e-3
-"""Largest way of a keypoint's link in a step [m]. Other pieces of the object may be in the way."""
+"""Longest distance that a keypoint's link moves in a step [m]. Other pieces of the object may be near."""
 _DEPTH_WEIGHT = 100.0
 """Weight of an overlap; the movement of a keypoint's link has weight 1."""
 _DAMPING = 1e-4

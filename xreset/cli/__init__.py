@@ -118,7 +118,10 @@ _NEEDLESS = {
     "--resume": "a training continues with --out RUN alone, or with its whole command",
 }
 """Flag of earlier versions -> why it is not needed."""
-_SQUEEZE = "fingers press with --squeeze.force and the object's weight, in balance; with --squeeze.force 0 no finger presses"
+_SQUEEZE = (
+    "fingers press with --squeeze.force and the object's weight, in balance; with --squeeze.force 0"
+    " no finger presses"
+)
 _GONE_FLAGS = {
     "--settle": "episodes begin as recorded, because starts at rest gained nothing",
     "--squeeze.weight": _SQUEEZE,

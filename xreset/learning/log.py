@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import os
-import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -54,8 +52,6 @@ class TrainingLog:
         Raises:
             XResetError: the package wandb is missing.
         """
-        from torch.utils.tensorboard import SummaryWriter
-
         self._online = None
         if wandb is not None:
             with needs("wandb, which sends learning curves,", "wandb"):
@@ -69,10 +65,8 @@ class TrainingLog:
         self._folder = folder
         self.lift = read_lift(folder).up_to(done) if done else Lift()
         """The last iteration's success from home is 0 as long as a teacher acts in some worlds."""
-        self._thread_hook = threading.excepthook
-        threading.excepthook = partial(_except_writer, self._thread_hook)
         with self._written():
-            self._curves = SummaryWriter(str(folder))
+            self._curves = _EventFile(folder)
         self._returns = torch.zeros(num_envs, device=device)
         self._lengths = torch.zeros(num_envs, device=device)
         # sum of returns, sum of lengths, number of episodes
@@ -119,8 +113,7 @@ class TrainingLog:
         if episodes:
             curves |= {"episode/return": returns / episodes, "episode/length": lengths / episodes}
         with self._written():
-            for tag, value in curves.items():
-                self._curves.add_scalar(tag, value, iteration)
+            self._curves.add(iteration, curves)
         if self._online is not None:
             self._online.log(curves, step=iteration)
         from_home = means["task/success_from_home"]
@@ -154,11 +147,8 @@ class TrainingLog:
     def close(self) -> None:
         """Print the last line, and end the files."""
         self._print_line()
-        try:
-            with self._written():
-                self._curves.close()
-        finally:
-            threading.excepthook = self._thread_hook
+        with self._written():
+            self._curves.close()
         if self._online is not None:
             self._online.finish()
         self.write_lift()
@@ -175,7 +165,29 @@ class TrainingLog:
             ) from error
 
 
-def _except_writer(hook: Callable[[Any], Any], failed: Any) -> None:
-    """Hand errors of threads on, except those of TensorBoard's writer, which raises them in the main thread again."""
-    if type(failed.thread).__name__ != "_AsyncWriterThread":
-        hook(failed)
+class _EventFile:
+    """A file of curves for TensorBoard. Each iteration is on disk at once, and an error is raised where it happens:
+    torch's own writer has a thread, which prints a traceback of its own."""
+
+    def __init__(self, folder: Path) -> None:
+        from tensorboard.compat.proto.event_pb2 import Event  # pyright: ignore[reportMissingImports]
+        from tensorboard.summary.writer.record_writer import RecordWriter
+
+        self._event = Event
+        self._file = RecordWriter((folder / f"events.out.tfevents.{time.time_ns()}").open("xb"))
+        self._write(Event(wall_time=time.time(), file_version="brain.Event:2"))
+
+    def add(self, iteration: int, curves: dict[str, float]) -> None:
+        """Write the values of an iteration: tag -> value."""
+        event = self._event(wall_time=time.time(), step=iteration)
+        for tag, value in curves.items():
+            event.summary.value.add(tag=tag, simple_value=value)
+        self._write(event)
+
+    def _write(self, event: Any) -> None:
+        self._file.write(event.SerializeToString())
+        self._file.flush()
+
+    def close(self) -> None:
+        """End the file."""
+        self._file.close()

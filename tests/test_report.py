@@ -595,11 +595,18 @@ class CommandTest(Reported):
             robot="openarm",
         )
         printed = succeeds("report", self.folder)
-        for word in ("mujoco", "sapien", "49.8%", "index.html"):
+        for word in ("50% in mujoco", "50% in sapien", "index.html"):
             self.assertIn(word, printed)
         self.assertNotIn("note:", printed)
+        self.assertNotIn("49.8%", printed, "the table of xreset eval")
         html = (self.folder / "report" / "index.html").read_text()
         self.assertEqual(html.count("<video"), 2)
+
+    def test_several_runs_have_tables(self):
+        self.write(("mujoco",), robot="a-robot-that-is-not-installed")
+        runs = (f"one={self.folder}", f"other={self.folder}")
+        printed = succeeds("report", *runs, "--out", self.folder / "page")
+        self.assertEqual(printed.count("49.8%"), 2)
 
     def test_numbers_are_reported_even_where_no_clip_can_be_drawn(self):
         self.write(("mujoco",), robot="a-robot-that-is-not-installed")

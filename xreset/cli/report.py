@@ -18,9 +18,11 @@ def _show(report: Report, options: Mapping[str, Any]) -> None:
     from xreset.eval import table
     from xreset.eval.report.make import headline
 
-    for training in report.evaluated:
-        console.print(table.results_table(list(training.results.values())))
-    console.print(headline(report.evaluated))
+    if len(report.evaluated) == 1:  # xreset eval has printed its table
+        console.print(headline(report.evaluated))
+    else:
+        for training in report.evaluated:
+            console.print(table.results_table(list(training.results.values())))
     show_notes(report.notes)
     if options["film"]:
         places = []

@@ -65,7 +65,7 @@ from xreset.objects.meshes import read_mesh
 from xreset.objects.properties import properties_of
 from xreset.pictures.view.load import load_view
 from xreset.policy.onnx_policy import OnnxPolicy, policy_contract
-from xreset.robot_tools.sources import read_source
+from xreset.robot_tools.sources import completed, read_source
 from xreset.runtime import load_controller
 from xreset.runtime.contract import KEY, parse_contract
 from xreset.task.config import ObservationConfig, TaskConfig
@@ -267,7 +267,7 @@ def add_deployed(every):
 
 def add_robots(every):
     def imported(path):
-        return read_source(path, [])
+        return completed(read_source(path, []), path, [])
 
     every.add("robot.toml", "toy.toml", read_description, "text")
     every.add("URDF", every.toy.urdf.name, urdf.load_urdf, "text")

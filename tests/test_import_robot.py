@@ -27,7 +27,7 @@ from xreset.robot_tools import homes
 from xreset.robot_tools.check import check
 from xreset.robot_tools.draft import hand_side
 from xreset.robot_tools.importer import make_robot
-from xreset.robot_tools.sources import bare, read_source
+from xreset.robot_tools.sources import bare, completed, read_source
 from xreset.spec import SceneSpec, TableSpec
 
 ARCHIVES = DEFAULT.parent / "robots"
@@ -125,7 +125,8 @@ class Toy(Robots):
     def read(self, file, text):
         """Tree and notes."""
         notes = []
-        return read_source(self.file(file, text), notes), " ".join(notes)
+        path = self.file(file, text)
+        return completed(read_source(path, notes), path, notes), " ".join(notes)
 
     def test_a_folder_that_passes_the_check_and_says_what_it_guessed(self):
         spec = self.spec
@@ -289,7 +290,7 @@ class Toy(Robots):
     def test_mjcf_is_the_same_hand(self):
         mjcf, notes = self.read("hand.xml", MJCF)
         self.assertNotIn("closed loops", notes)
-        urdf = read_source(self.hand, [])
+        urdf = completed(read_source(self.hand, []), self.hand, [])
         self.assertEqual((mjcf.link_names, mjcf.mimics), (urdf.link_names, urdf.mimics))
         for a, b in zip((*mjcf.joints, *mjcf.links), (*urdf.joints, *urdf.links), strict=True):
             for name in ("name", "type", "lower", "upper"):
@@ -441,6 +442,7 @@ class Toy(Robots):
         )
         said = " ".join(made.guessed)
         self.assertIn("left out: joints that only let the hand float: b0, b1, b2", said)
+        self.assertEqual(said.count("b0"), 1, "it gets neither limits nor a speed")
         self.assertIn("never collide, because the MJCF says so: f1_a and f2_a", said)
         self.assertIn("left out: what moves next to the hand: pen", said)
         spec = load_robot(made.folder)

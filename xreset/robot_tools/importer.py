@@ -33,6 +33,7 @@ from xreset.robot_tools.homes import hold_near, hold_up
 from xreset.robot_tools.sources import (
     bare,
     combined,
+    completed,
     grounded,
     last_link,
     read_source,
@@ -121,7 +122,10 @@ def make_robot(
                 f"{hand} holds the arm as well: it has all joints of {arm}. Leave out --arm, or remove the arm's links "
                 "and joints from the hand's file."
             )
-        hand_tree = renamed(grounded(hand_tree, notes), carrier.tree)
+        hand_tree = grounded(hand_tree, notes)
+    hand_tree = completed(hand_tree, hand, notes)
+    if carrier is not None:
+        hand_tree = renamed(hand_tree, carrier.tree)
     to_say = [*_TO_SAY]
     with atomic_folder(out) as work:
         found = Hand(hand_tree, work, thumb, notes)
@@ -182,12 +186,13 @@ class _Arm:
 
 def _read_arm(path: Path, flange: str | None, notes: list[str]) -> _Arm:
     """Read an arm, or that of a robot with a robot.toml, and find its flange where that is None."""
+    robot = None
     if path.is_dir() or str(path) in robot_names():
         robot = load_robot(path)
-        tree = read_source(robot.urdf, notes)
+        path = robot.urdf
+    tree = completed(read_source(path, notes), path, notes)
+    if robot is not None:
         flange = flange or tree.above[robot.hand_root].parent
-    else:
-        tree = read_source(path, notes)
     if flange is None:
         flange = last_link(tree)
         notes.append(f"the hand is carried by the arm's link {flange!r} (--flange says another)")
@@ -197,7 +202,7 @@ def _read_arm(path: Path, flange: str | None, notes: list[str]) -> _Arm:
 def _holds_arm(hand: RobotTree, arm: RobotTree) -> bool:
     """Return whether a hand has all moving joints of an arm: names may be the same in two files, places are not."""
     arm_joints = {_place(joint) for joint in arm.moved_by.values()}
-    return bool(arm_joints) and arm_joints <= {_place(joint) for joint in hand.moved_by.values()}
+    return bool(arm_joints) and arm_joints <= {_place(joint) for joint in hand.joints}
 
 
 def _place(joint: Joint) -> tuple[str, ...]:

@@ -67,7 +67,8 @@ Kinova."""
 
 
 def read_source(path: str | Path, notes: list[str]) -> RobotTree:
-    """Read a robot, or a part of one, from a URDF, or from an MJCF (needs the engine MuJoCo).
+    """Read a robot, or a part of one, from a URDF, or from an MJCF (needs the engine MuJoCo), before it is
+    :func:`completed`.
 
     Args:
         path: the file.
@@ -83,10 +84,18 @@ def read_source(path: str | Path, notes: list[str]) -> RobotTree:
     if root.tag == "mujoco":
         with needs(f"mujoco, which reads {path},", "mujoco", RobotError):
             from xreset.robot_tools.mjcf import read_mjcf
-        tree = read_mjcf(path, notes)
-    else:
-        tree = load_urdf(path, visuals=True)
-        _note_urdf(root, tree, notes)
+        return read_mjcf(path, notes)
+    tree = load_urdf(path, visuals=True)
+    _note_urdf(root, tree, notes)
+    return tree
+
+
+def completed(tree: RobotTree, path: str | Path, notes: list[str]) -> RobotTree:
+    """Return the tree of a file with limits, speeds, couplings and masses that joints and links can have.
+
+    Raises:
+        RobotError: the file contradicts itself, or its units are not known.
+    """
     tree = _with_speeds(_with_ranges(tree, path, notes), notes)
     return _with_masses(_with_sources(tree, path, notes), notes)
 
@@ -233,7 +242,7 @@ def combined(arm: RobotTree, hand: RobotTree, flange: str, T_flange_hand: np.nda
     )
 
 
-def _with_ranges(tree: RobotTree, path: Path, notes: list[str]) -> RobotTree:
+def _with_ranges(tree: RobotTree, path: str | Path, notes: list[str]) -> RobotTree:
     """Return the tree with finite limits that joints can have; a joint without a range is fixed."""
     units = {}
     for kind, (name, unit, most) in _UNITS.items():
@@ -303,7 +312,7 @@ def _with_speeds(tree: RobotTree, notes: list[str]) -> RobotTree:
     return replace(tree, joints=tuple(joints))
 
 
-def _with_sources(tree: RobotTree, path: Path, notes: list[str]) -> RobotTree:
+def _with_sources(tree: RobotTree, path: str | Path, notes: list[str]) -> RobotTree:
     """Return the tree with mimic joints that follow a joint that follows nothing; a mimic joint has the limits that its
     source gives it."""
     joints = []

@@ -29,7 +29,7 @@ HESSIAN_WAVES = 18
 """Blocks that add contacts to the solver's matrix, in multiples of those that a GPU runs at a time; the engine has 6.
 
 Every world gets as many blocks, and a step waits for the world with the most contacts, which has ten times the mean.
-With 18 a step takes 3.2 % less (docs/results.md#speed).
+With 18 a step takes 3.2 % less (docs/lab-book.md, "Speed").
 """
 
 

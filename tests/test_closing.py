@@ -173,6 +173,10 @@ class FingersTest(TestCase):
         self.assertEqual(
             fingers.leading.tolist(), [[True, True, False]] * 3, "finger_b has no shape of its own"
         )
+        for within, rows in ((0.005, [True, False, False]), (0.010, [True, True, False])):
+            pressing = fingers.pressing(within)
+            self.assertEqual(pressing[:, 0].tolist(), rows)
+            self.assertFalse(pressing[:, 2].any())
         wrist = self.wrist_axis(joints)
         assert_close(fingers.inward[:, 0], -wrist, atol=0.02, rtol=0)
         assert_close(fingers.inward[:, 1], wrist, atol=0.02, rtol=0)
@@ -222,8 +226,7 @@ class FingersTest(TestCase):
         fingers, joints = self.fingers(0.0201, 0.0501)
 
         def squeezed(force, robot=ROBOT):
-            pressing = fingers.leading & (fingers.gap < 0.005)
-            return squeeze_targets(robot, fingers, joints, force * pressing)
+            return squeeze_targets(robot, fingers, joints, force * fingers.pressing(0.005))
 
         for force in (1.0, 2.5):
             target = squeezed(force)

@@ -52,6 +52,11 @@ class Fingers:
             lead.scatter_(1, mine[self.gap[:, mine].argmin(dim=-1)][:, None], True)
         return lead
 
+    def pressing(self, within: float) -> Tensor:
+        """Return which links press: of each finger the nearest one, if it is nearer to the object than a distance [m]:
+        [M, G] bool."""
+        return self.leading & (self.gap < within)
+
     def grasp(self, within: float) -> Tensor:
         """Return whether the thumb and another finger are nearer to the object than a distance [m]: [M] bool."""
         near = self.gap < within
@@ -125,7 +130,8 @@ def fingers_of(
 
 
 _REACH = 0.005
-"""A finger presses if it is nearer than this to the object [m]."""
+"""A finger of a bank's state presses if it is nearer than this to the object [m]: the object's weight may be on it in
+the first step of an episode."""
 
 
 def grip_forces(fingers: Fingers, force: float) -> Tensor:
@@ -134,7 +140,7 @@ def grip_forces(fingers: Fingers, force: float) -> Tensor:
 
     With one force for all objects, heavy ones slip and light ones tilt.
     """
-    pressing = fingers.leading & (fingers.gap < _REACH)
+    pressing = fingers.pressing(_REACH)
     return (force + fingers.weight[:, None]) * pressing * _balance(fingers, pressing)
 
 

@@ -53,7 +53,8 @@ DISTANCE = 0.03
 ANGLE = np.pi / 4
 """Largest change of the object's orientation in the palm's frame [rad]."""
 _REACH = 0.010
-"""A finger presses if it is nearer than this to the object [m]."""
+"""A finger presses if it is nearer than this to the object [m]: farther away than in a bank's states, because it has
+time to close before the object gets its weight."""
 _WORLDS = 32
 """Worlds at a time."""
 _CLOSE_STEPS = 15
@@ -240,7 +241,7 @@ def _grasps(
             f"robot {robot.name!r}: in no lifted state are the thumb and another finger within "
             f"{1e3 * _REACH:g} mm of the object. Check the fingertips' frames (xreset robots check --picture)."
         )
-    force = squeeze.newtons(len(robot.fingertips)) * (fingers.leading & (fingers.gap < _REACH))
+    force = squeeze.newtons(len(robot.fingertips)) * fingers.pressing(_REACH)
     targets = squeeze_targets(robot, fingers, lifted.joint_pos, force)[chosen]
     tried = lifted.with_states(np.array(chosen))
     arrays = (tried.joint_pos, tried.object_pos, tried.object_quat_wxyz, targets)

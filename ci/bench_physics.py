@@ -14,7 +14,7 @@ through that of all processes of the backend, this one included; in brackets the
 in slices of some hundredths of a second, every other time in reverse, each slice after a control step that is not counted; ratios are of
 slices of one turn, and figures are medians over turns. So other programs on the machine change the wall clock, and not the CPU's share.
 
-By default there are 64 worlds, as many as `xreset eval`, `attribute` and `resets` run at a time. To wake a process costs the same whatever
+By default there are 64 worlds, as many as `xreset eval`, `stress` and `resets` run at a time. To wake a process costs the same whatever
 it then has to do, as much as half a world of MuJoCo, so what the pool loses shows more, the fewer worlds there are: see --num-envs 8.
 """
 

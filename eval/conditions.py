@@ -1,7 +1,6 @@
 """Conditions of an experiment: a physical property with a value, a fault between policy and robot, or nothing.
 
-``properties.toml`` lists what can be changed. Sweeps (``xreset stress``) and the attribution to differences of engines
-(:mod:`xreset.eval.engines.attribution`) share it.
+``properties.toml`` lists what ``xreset stress`` can change.
 """
 
 from __future__ import annotations
@@ -47,11 +46,6 @@ class Property:
     most: float = 1000.0
     needs: Capability | None = None
     in_steps: bool = False
-    measured: str = ""
-    """Field of :class:`~xreset.eval.engines.measure.Measured`."""
-    resolution: float = 0.0
-    absolute: bool = False
-    shown_unit: str = ""
     of_cameras: bool = False
     on_robot: bool = False
     scaled: dict[str, float] = field(default_factory=dict)
@@ -72,28 +66,10 @@ class Property:
         """Field of the task's randomization."""
         return self.task_field or self.name.replace(" ", "_")
 
-    def shown(self, value: float) -> str:
-        """Return a measured number as text, in ``shown_unit``."""
-        scale = 1e3 if self.shown_unit in ("mm", "ms") else 1.0
-        return f"{value * scale:.3g} {self.shown_unit}".rstrip()
-
     def amount(self, value: float) -> str:
         """Return a value with its unit, such as ``0.033 s`` or ``x 0.7``."""
         number = f"{float(f'{value:.3g}'):g}"
         return f"x {number}" if self.unit == "x" else f"{number} {self.unit}".rstrip()
-
-    def set_in(self, task: TaskConfig, value: float) -> TaskConfig:
-        """Return the task with the property at one value.
-
-        Raises:
-            XResetError: the property cannot have the value.
-        """
-        drawn = value / task.control_dt if self.in_steps else value
-        try:
-            changed = replace(task.randomization, **{self.changed_field: (drawn, drawn)})
-            return replace(task, randomization=changed)
-        except ValueError as error:
-            raise self._impossible(value, error) from None
 
     def at(self, value: float, task: TaskConfig) -> Condition:
         """Return the condition that the property has a value and everything else is as in a task.
@@ -101,19 +77,25 @@ class Property:
         Raises:
             XResetError: the property cannot have the value.
         """
-        if not self.is_fault:
-            return Condition(task=self.set_in(task, value), property=self.option, value=value)
+        faults = None
+        try:
+            if self.is_fault:
+                faults = self._faults(value)
+            else:
+                drawn = value / task.control_dt if self.in_steps else value
+                changed = replace(task.randomization, **{self.changed_field: (drawn, drawn)})
+                task = replace(task, randomization=changed)
+        except ValueError as error:
+            raise XResetError(
+                f"{self.option} {self.amount(value)} cannot be tried: {error}."
+            ) from None
+        return Condition(task=task, property=self.option, value=value, faults=faults)
+
+    def _faults(self, value: float) -> Faults:
         from xreset.live.faults import Faults
 
         sizes: dict[str, Any] = {name: factor * value for name, factor in self.scaled.items()}
-        try:
-            faults = Faults(**self.fixed, **sizes)
-        except ValueError as error:
-            raise self._impossible(value, error) from None
-        return Condition(task=task, property=self.option, value=value, faults=faults)
-
-    def _impossible(self, value: float, error: ValueError) -> XResetError:
-        return XResetError(f"{self.option} {self.amount(value)} cannot be tried: {error}.")
+        return Faults(**self.fixed, **sizes)
 
 
 def _properties() -> tuple[Property, ...]:
@@ -126,12 +108,10 @@ def _properties() -> tuple[Property, ...]:
 
 
 PROPERTIES = _properties()
-SWEPT = tuple(p for p in PROPERTIES if p.values and not p.is_fault)
-"""Physical properties that can be swept."""
+SWEPT = tuple(p for p in PROPERTIES if not p.is_fault)
+"""Physical properties."""
 FAULTS = tuple(p for p in PROPERTIES if p.is_fault or p.on_robot)
 """Faults between a policy and a robot, and physical properties that are tried with them."""
-COMPARED = {p.name: p for p in PROPERTIES if p.measured}
-"""The properties in which engines are compared, by name."""
 _BY_OPTION = {p.option: p for p in PROPERTIES}
 
 
@@ -148,14 +128,13 @@ def chosen(
     Raises:
         XResetError: a property is unknown, or a value is impossible.
     """
-    known = {prop.option: prop for prop in PROPERTIES if prop.values}
     found = []
     for text in (wanted,) if isinstance(wanted, str) else wanted:
         name, _, values = text.partition("=")
         name = name.replace("_", "-")
-        if name not in known:
-            raise XResetError(f"Unknown property {name!r}. Choose from: {', '.join(known)}.")
-        prop = known[name]
+        if name not in _BY_OPTION:
+            raise XResetError(f"Unknown property {name!r}. Choose from: {', '.join(_BY_OPTION)}.")
+        prop = _BY_OPTION[name]
         if values:
             prop = replace(prop, values=_values(text, values, prop))
         found.append(prop)
@@ -181,7 +160,7 @@ def _values(text: str, values: str, prop: Property) -> tuple[float, ...]:
 
 
 def nominal_task(task: TaskConfig) -> TaskConfig:
-    """Return the task without random draws, so that :meth:`Property.set_in` can set its properties."""
+    """Return the task without random draws, so that :meth:`Property.at` can set its properties."""
     r = task.randomization
     middle = sum(r.friction) / 2
     still = RandomizationConfig(

@@ -12,8 +12,7 @@ import numpy as np
 from xreset.eval.conditions import Property, property_of
 from xreset.eval.plots import COLORS, svg
 from xreset.eval.results import EvalResult
-from xreset.eval.stats import Interval, Table, bootstrap_ci95, ci95, mean
-from xreset.eval.table import points_text
+from xreset.eval.stats import Interval, Table, bootstrap_ci95, mean
 from xreset.files.checks import frozen
 
 if TYPE_CHECKING:
@@ -36,38 +35,23 @@ LEAST = 0.5
 
 @frozen
 class Effect:
-    """Task progress of some episodes, and its difference to the same episodes unchanged; intervals of 95 %."""
+    """Task progress of some episodes, and its difference to the same episodes unchanged, with the 95 % interval."""
 
-    value: float = math.nan
-    """Value of the changed property; NaN where it is not one property that is changed."""
+    value: float
+    """Value of the property."""
     task_progress: float
-    ci95: Interval
     difference: float
     difference_ci95: Interval
-    published_success: float
-    """Share of the episodes that succeed in the sense of the published paper; NaN if it was not measured."""
-
-    @property
-    def is_certain(self) -> bool:
-        """Whether the interval of the difference excludes zero."""
-        low, high = self.difference_ci95
-        return low > 0 or high < 0
-
-    def difference_text(self) -> str:
-        """Return the difference in points, and its interval."""
-        return points_text(self.difference, *self.difference_ci95)
 
 
-def effect(episodes: Table, nominal: Table, value: float = math.nan) -> Effect:
-    """Compare episodes one by one with the same episodes unchanged. Intervals are bootstraps over demonstrations."""
+def effect(episodes: Table, nominal: Table, value: float) -> Effect:
+    """Compare episodes one by one with the same episodes unchanged. The interval is a bootstrap over demonstrations."""
     difference = episodes["task_progress"].to_numpy() - nominal["task_progress"].to_numpy()
     return Effect(
         value=value,
         task_progress=mean(episodes, "task_progress"),
-        ci95=ci95(episodes, "task_progress"),
         difference=float(difference.mean()),
         difference_ci95=bootstrap_ci95(difference, episodes["sequence"].to_numpy()),
-        published_success=mean(episodes, "published_success"),
     )
 
 

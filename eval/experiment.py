@@ -1,4 +1,4 @@
-"""Play a policy under conditions: one experiment, from which evaluations, sweeps and attributions are group-bys.
+"""Play a policy under conditions: one experiment, from which evaluations and sweeps are group-bys.
 
 :func:`play` is the only player: policy x trial x conditions give one table of episodes for each engine.
 """
@@ -42,7 +42,6 @@ def play(
     *,
     episodes: int,
     on_robot: bool = False,
-    measured: dict[str, float] | None = None,
     left_out: dict[str, str] | None = None,
     progress: Progress = unseen,
 ) -> EvalResult:
@@ -57,7 +56,6 @@ def play(
         folder: where the result is written.
         episodes: episodes of each demonstration, each with another perturbation, the same under every condition.
         on_robot: whether a robot's control loop plays, as faults need.
-        measured: property -> what was measured of the engine.
         left_out: property that has no condition -> why.
         progress: called with what is done and what is to be done in all; for one condition control steps, else
             conditions.
@@ -112,7 +110,6 @@ def play(
         vision=vision if vision.cameras else None,
         episode_seconds=_length(trial),
         left_out=left_out or {},
-        measured=measured or {},
         stopped=dict(stopped),
         episodes=pd.concat(tables, ignore_index=True),
     )

@@ -166,8 +166,6 @@ class EvalResult(Brief, Checked):
     """Length of an episode [s]. None: an earlier version did not state it; it was that of the policy's training."""
     left_out: dict[str, str] = field(default_factory=dict)
     """Property that was not changed -> reason."""
-    measured: dict[str, float] = field(default_factory=dict)
-    """Property -> what was measured of the engine, if it was compared with another one."""
     stopped: dict[str, int] = field(default_factory=dict)
     """Reason why a robot's control loop stopped -> number of episodes."""
     episodes: Table = field(compare=False)

@@ -164,10 +164,6 @@ class UsageTest(TestCase):
         for words, told in (
             ("engines check --backend bulet", ["--backend is now --engine"]),
             ("engines compare none --only mug", ["--only is now --object"]),
-            (
-                "engines attribute zero --demos none --towards x --only effort",
-                ["--only is now --property"],
-            ),
             ("objects list --objects=none", ["--objects is now --meshes", "no folder 'none'"]),
             ("demos synth --out x.npz --objects nothing", ["Unknown object 'nothing'"]),
         ):
@@ -178,11 +174,16 @@ class UsageTest(TestCase):
                 for each in told:
                     self.assertIn(each, err)
 
-    def test_flags_that_are_gone_say_what_is_done_now(self):
+    def test_flags_and_commands_that_are_gone_say_what_is_done_now(self):
         for words, told in (
             ("eval zero --demos none --settle", "--settle is gone: episodes begin as recorded"),
             ("resets none --out b.npz --squeeze.weight 0", "press with --squeeze.force and the"),
             ("resets none --out b.npz --squeeze.reach=0.1", "--squeeze.reach is gone: fingers"),
+            ("select runs/soup", "select is gone: evaluate checkpoints"),
+            (
+                "engines attribute zero --towards sapien",
+                "engines attribute is gone: xreset engines",
+            ),
         ):
             with self.subTest(words):
                 code, _, err = run(*words.split())

@@ -398,6 +398,7 @@ class ResultsTest(InFolder):
             ("schema version 'xreset-eval/0'", {"schema": "xreset-eval/0"}),
             ("'<script>alert", {"engine_version": ["<script>alert(1)</script>"]}),
             ("episodes is None, expected an object", {"episodes": ...}),
+            ("measured is {'effort': 1.0}. This option was removed", {"measured": {"effort": 1.0}}),
         ):
             content = {name: x for name, x in (whole | changes).items() if x is not ...}
             path.write_text(json.dumps(content))
@@ -433,7 +434,7 @@ class ResultsTest(InFolder):
         rows = pd.DataFrame({name: columns[name] for name in names}).to_dict("records")
         earlier = {"schema": "xreset-episodes/1", "episodes": rows}
         path.with_name(f"{engine}.episodes.json").write_text(json.dumps(earlier))
-        for name in ("left_out", "measured", "stopped"):
+        for name in ("left_out", "stopped"):
             del content[name]
         content["backend"] = content.pop("engine")
         content["backend_version"] = content.pop("engine_version")

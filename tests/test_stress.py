@@ -36,7 +36,7 @@ class StressedTest(TestCase):
         self.assertTrue(plain.enabled and not plain.scales_drives)
         for prop in SWEPT:
             value = prop.values[0]
-            found = prop.set_in(nominal_task(task), value)
+            found = prop.at(value, nominal_task(task)).task
             set_to = 60 * value if prop.in_steps else value  # 60 control steps a second
             assert_allclose(getattr(found.randomization, prop.changed_field), (set_to, set_to))
             self.assertEqual(
@@ -69,7 +69,7 @@ class StressedTest(TestCase):
         with self.assertRaisesRegex(
             XResetError, "action-latency 5 s cannot be tried: .* fewer than the 300 of an episode"
         ):
-            late.set_in(TaskConfig(), 5.0)
+            late.at(5.0, TaskConfig())
         (missed,) = chosen(["missed-deadlines=0.5"])
         with self.assertRaisesRegex(XResetError, "missed-deadlines 1.5 of the steps cannot be"):
             missed.at(1.5, TaskConfig())
@@ -77,7 +77,7 @@ class StressedTest(TestCase):
         with self.assertRaisesRegex(
             XResetError, "object-mass x 0 cannot be tried: mass_scale .*0.0.*above 0"
         ):
-            light.set_in(TaskConfig(), 0.0)
+            light.at(0.0, TaskConfig())
 
 
 class CurveTest(TestCase):

@@ -1,9 +1,8 @@
-"""Compare physics engines: how far they agree on grasps and on an action sequence, and which of their differences costs
-a policy its skill.
+"""Compare physics engines: how far they agree on grasps and on an action sequence.
 
 Modules: ``contract`` (the checks of :mod:`xreset.backends.conformance`), ``agreement`` (grasps, with ``grasps``),
-``replay`` (the same actions, from ``actions``), ``attribution`` (a policy, with the properties that ``measure`` finds);
-``recording`` plays targets for the second and the third. ``verbs`` has the commands.
+``replay`` (the same actions, from ``actions``); ``recording`` plays targets for the second and the third. ``verbs`` has
+the commands.
 
 .. code-block:: python
 

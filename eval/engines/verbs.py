@@ -11,7 +11,6 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from xreset.errors import XResetError
 from xreset.files.checks import NonNegativeInt, Option, Output, PositiveInt, Seed, obeys_rules
 from xreset.files.progress import unseen
 from xreset.files.storage import file_hash, measured, write_json, write_whole
@@ -19,13 +18,10 @@ from xreset.physics.plugins import Device
 
 if TYPE_CHECKING:
     from xreset.eval.engines.agreement import Parity
-    from xreset.eval.engines.attribution import Attribution
     from xreset.eval.engines.replay import TraceResult
-    from xreset.eval.policy_spec import PolicySpec
     from xreset.eval.rollout import Engine
-    from xreset.resets.inputs import Data
 else:  # a command has texts in place of these
-    Attribution = Parity = TraceResult = PolicySpec = Engine = Data = Any
+    Parity = TraceResult = Engine = Any
 
 
 @obeys_rules
@@ -175,66 +171,3 @@ def trace_engines(
     )
     write_json(Path(out) / "trace.json", measured(found.as_dict()))
     return found
-
-
-@obeys_rules
-def attribute(
-    policy: str | Path | PolicySpec,
-    demos: str | Path | Data,
-    towards: str | Engine,
-    engine: str | Engine = "mujoco",
-    *,
-    properties: Annotated[str | Sequence[str], Option("property")] = (),
-    episodes: PositiveInt = 1,
-    robot: str | Path | None = None,
-    meshes: str | Path | None = None,
-    seed: Seed = 0,
-    device: Device = "cpu",
-    num_envs: PositiveInt = 64,
-    out: Output | None = None,
-    progress: Callable[[str, float, int], None] = unseen,
-) -> Attribution:
-    """Find the physical difference between two engines that costs a policy its skill.
-
-    First both engines are measured through their interface: friction, drive stiffness and damping, timestep. Then the
-    policy plays the same episodes in one engine, in that engine with one property changed to the value of the other
-    engine, with all properties changed, and in the other engine.
-
-    Args:
-        policy: run folder, one of its checkpoints (.pt), exported policy (.onnx), name of a policy that ships with
-            xreset (xreset policies), or a baseline: zero, ik (open-loop kinematic retargeting).
-        demos: demonstrations (xreset demos) or retargeted motion (xreset retarget): starts and goals, and the path of
-            ik. xreset demos select makes a file of some objects.
-        towards: engine towards which the properties are changed, usually the one in which the policy does worse.
-        engine: engine in which the properties are changed.
-        properties: property to change, or several; default: all in which the engines differ.
-        episodes: episodes of each demonstration.
-        robot: name or folder of the robot; default: the policy's own. Baselines need it.
-        meshes: folder of real meshes; default: what the policy was trained with, else the stand-ins.
-        seed: seed of the perturbations of the starts, which are the same in every engine.
-        device: where engines run that can use a GPU: cpu or cuda.
-        num_envs: worlds that run at the same time.
-        out: folder for the results, one file for each engine; default: attribute/ next to the policy's results.
-        progress: called with (engine, conditions done, conditions in all).
-
-    Returns:
-        The results in both engines, and what each property costs.
-
-    Raises:
-        PolicyError: the policy is unknown.
-        XResetError: an engine is unknown or cannot be measured, or both are the same.
-    """
-    from xreset.eval.engines import attribution
-    from xreset.eval.policy_spec import load_policy
-    from xreset.eval.rollout import chosen_engines, load_trial
-
-    if engine == towards:
-        raise XResetError(f"engine and towards are both {engine!r}. Choose two engines.")
-    spec = load_policy(policy, robot=robot)
-    a, b = chosen_engines([engine, towards], device)
-    trial = load_trial(spec, demos, meshes=meshes, seed=seed, num_envs=num_envs)
-    folder = Path(out) if out else spec.folder.parent / "attribute"
-    wanted = [properties] if isinstance(properties, str) else properties
-    return attribution.attribute(
-        spec, a, b, trial, folder, episodes=episodes, only=wanted, progress=progress
-    )

@@ -107,11 +107,11 @@ _MOVED = {
 """Command of earlier versions -> its present words."""
 _GONE = {
     "select": "evaluate checkpoints, xreset eval RUN/checkpoints/NUMBER.pt, and compare them with xreset report",
+    "engines attribute": "xreset engines check measures engines, xreset stress what a policy tolerates",
 }
 """Command of earlier versions -> what to do in place of it."""
 _RENAMED_IN = {
     "engines compare": {"--only": "--object"},
-    "engines attribute": {"--only": "--property"},
 }
 """Command -> flag of earlier versions -> its present name."""
 _NEEDLESS = {
@@ -199,9 +199,10 @@ def perform(argv: list[str]) -> None:
         return
     name = argv[0]
     arguments = argv[1:]
-    if name in _GONE:
-        print(f"xreset: {name} is gone: {_GONE[name]}.", file=sys.stderr)
-        raise SystemExit(2)
+    for gone in (name, " ".join(argv[:2])):
+        if gone in _GONE:
+            print(f"xreset: {gone} is gone: {_GONE[gone]}.", file=sys.stderr)
+            raise SystemExit(2)
     if name not in COMMANDS:
         print(f"xreset: Unknown command {name!r}.\n\n{_usage()}", file=sys.stderr)
         raise SystemExit(2)

@@ -1,4 +1,4 @@
-"""``xreset engines``: list, check, compare, trace and attribute differences between physics engines."""
+"""``xreset engines``: list, check, compare and trace physics engines."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ from xreset.physics.plugins import backend_names, backend_status
 
 if TYPE_CHECKING:
     from xreset.eval.engines.agreement import Parity
-    from xreset.eval.engines.attribution import Attribution
     from xreset.eval.engines.replay import TraceResult
 
 
@@ -96,26 +95,9 @@ def _show_trace(found: TraceResult, options: Mapping[str, Any]) -> None:
     console.print(f"results in {options['out']}")
 
 
-def _show_attribution(found: Attribution, options: Mapping[str, Any]) -> None:
-    from xreset.eval.engines import attribution
-
-    first = found.a
-    counts = (
-        f"episodes: {len(first.nominal)}, demonstrations: {first.nominal['sequence'].nunique()}, "
-        f"seed: {first.seed}"
-    )
-    title = f"{first.policy} on {first.robot}: what costs the skill between {first.engine} and {found.b.engine}"
-    console.print(attribution.rich_table(found, f"{title}\n{counts}"))
-    for line in attribution.not_tried(found):
-        console.print(line, style="dim")
-    console.print(attribution.verdict(found))
-    console.print(f"results in {found.folder}")
-
-
 COMMAND = {
     "": list_,
     "check": verb(verbs.check_engines, _show_checks, prepare=in_all_engines, engines=()),
     "compare": verb(verbs.compare_engines, _show_agreement, prepare=in_quick_engines, engines=()),
     "trace": verb(verbs.trace_engines, _show_trace, prepare=in_all_engines, engines=()),
-    "attribute": verb(verbs.attribute, _show_attribution),
 }

@@ -44,11 +44,13 @@ def _show(found: Evaluation, _options: Mapping[str, Any]) -> None:
 
 def _cell(curve: effects.Curve, index: int) -> str:
     """Return task progress as text; at other than the nominal value, with the difference to it and its interval."""
+    from xreset.eval.table import points_text
+
     point = curve.points[index]
     text = f"{100 * point.task_progress:.1f} %"
     if point.value == curve.property.nominal:
         return text
-    return f"{text}, {point.difference_text()}"
+    return f"{text}, {points_text(point.difference, *point.difference_ci95)}"
 
 
 COMMAND = verb(verbs.stress, _show)

@@ -43,6 +43,7 @@ REMOVED: dict[str, dict[str, Any]] = {
     "TrainConfig": {"random_episode_start": True, "target_success": None},
     "Data": {"goals": None, "synthetic_seed": 0},
     "Evaluation": {"unseen": False},
+    "EvalResult": {"measured": {}},
     "Runs": {"evaluations": [], "gpus": 1},
 }
 """Data class -> option -> the value that means what is done now. Files with another value are refused."""

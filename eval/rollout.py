@@ -35,7 +35,6 @@ from xreset.resets.schedule import schedule
 from xreset.retarget.file import Retargeted
 from xreset.spec import ObjectSpec, RobotSpec, SceneSpec
 from xreset.task.config import TaskConfig, evaluation_task, with_episodes_of
-from xreset.task.randomization import sample_friction
 from xreset.task.reading import Reading
 from xreset.task.terminations import out_of_bounds
 
@@ -196,14 +195,6 @@ def load_trial(
         meshes=folder,
         inputs=hashes,
     )
-
-
-def nominal_scene(robot: RobotSpec, objects: tuple[ObjectSpec, ...], task: TaskConfig) -> SceneSpec:
-    """Return the scene of a task with the pair friction of an evaluation, where friction is not drawn at random."""
-    scene = make_scene(robot, objects, task)
-    nominal = replace(task.randomization, enabled=False)
-    tip, link, table = sample_friction(1, nominal, torch.Generator())[0].tolist()
-    return replace(scene, friction=replace(scene.friction, tip=tip, link=link, table=table))
 
 
 def roll_out(

@@ -184,6 +184,7 @@ class UsageTest(TestCase):
                 "engines attribute zero --towards sapien",
                 "engines attribute is gone: xreset engines",
             ),
+            ("engines trace none", "engines trace is gone: xreset engines compare"),
         ):
             with self.subTest(words):
                 code, _, err = run(*words.split())

@@ -23,6 +23,7 @@ from tests.toy_bank import SOUP, SPAM, toy_bank
 from tests.toy_results import OBJECTS, toy_result, toy_rollouts
 from xreset import evaluate, load_object, load_policy
 from xreset.errors import FileFormatError, PolicyError, XResetError
+from xreset.eval.engines.recording import play
 from xreset.eval.metrics import METRICS, EpisodeMetrics, MetricPoints
 from xreset.eval.report.groups import estimate
 from xreset.eval.results import Evaluation, read_evaluation, read_traces, write_result
@@ -33,6 +34,7 @@ from xreset.files.storage import claim_folder
 from xreset.geometry.rotations import quat_from_axis_angle
 from xreset.objects.sampling import metric_points
 from xreset.physics import Contacts, Health, Links, State
+from xreset.task.config import RandomizationConfig, TaskConfig, TerminationConfig
 from xreset.task.reading import Reading
 
 CORNERS = tensor([[-1.0, -1, -1], [1, 1, -1], [1, -1, 1], [-1, 1, 1]]) * 0.05
@@ -306,6 +308,26 @@ class RecordedTest(TestCase):
         self.assertGreater(
             len({e.least_distance for e in found.episodes}), 2, "each world is judged by itself"
         )
+
+    def test_the_same_engine_repeats_the_episode_with_its_recorded_targets(self):
+        task = TaskConfig(
+            reset=toy_grasp.AT_HOME,
+            randomization=RandomizationConfig(enabled=False),
+            termination=TerminationConfig(episode_seconds=0.7),
+        )
+        trial = toy_grasp.trial(task, num_envs=1)
+        mujoco = engine("mujoco", workers=0)
+        episode = roll_out(toy_grasp.OpenLoop(), mujoco, trial, episodes=1).traces[1]
+        poses = (episode.joint_pos, episode.object_pos, episode.object_quat)
+        start = State.at_rest(*(torch.as_tensor(pose[:1]) for pose in poses))
+        targets = torch.as_tensor(episode.joint_target)[:, None].float()
+        self.assertEqual(len(targets), 42)
+        with trial.worlds(mujoco, torch.zeros(1, dtype=torch.long)) as env:
+            replayed = play(env.backend, start, targets)
+        every = slice(2, None, 3)  # control steps of 1/60 s between recorded states
+        for name in ("object_pos", "joint_pos"):
+            found = getattr(replayed, name)[every, 0]
+            assert_allclose(found, getattr(episode, name)[1:], atol=1e-6)
 
 
 class BootstrapTest(TestCase):

@@ -16,7 +16,6 @@ from tests.data import InFolder
 from tests.toy_bank import toy_retargeted
 from xreset import SceneSpec, load_object, robots, write_retargeted
 from xreset.errors import DemoError
-from xreset.eval.engines.actions import grasp_and_lift
 from xreset.eval.engines.agreement import (
     carried,
     compare,
@@ -215,8 +214,6 @@ class Finding(TestCase):
             atol=6e-4,
             rtol=0,
         )
-        actions = grasp_and_lift(self.robot, self.can, table[1:2])
-        self.assertEqual(actions.label, f"grasp and lift of {self.can.name}, {table.label[1]}")
         before = replace(motion, first_contact=np.full(5, -1))
         away = grasps_of(self.robot, self.can, [(0.2, 0.0)])
         for ungrasped, frames in ((before, 0), (away, 2)):

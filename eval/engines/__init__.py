@@ -1,8 +1,7 @@
-"""Compare physics engines: how far they agree on grasps and on an action sequence.
+"""Check physics engines, and compare them: how far they agree on grasps.
 
-Modules: ``contract`` (the checks of :mod:`xreset.backends.conformance`), ``agreement`` (grasps, with ``grasps``),
-``replay`` (the same actions, from ``actions``); ``recording`` plays targets for the second and the third. ``verbs`` has
-the commands.
+Modules: ``contract`` (the checks of :mod:`xreset.backends.conformance`) and ``page`` (their results), ``agreement``
+(with ``grasps``, which it tries, and ``recording``, which plays them). ``verbs`` has the commands.
 
 .. code-block:: python
 

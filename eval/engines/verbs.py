@@ -11,17 +11,16 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from xreset.files.checks import NonNegativeInt, Option, Output, PositiveInt, Seed, obeys_rules
+from xreset.files.checks import Option, Output, PositiveInt, obeys_rules
 from xreset.files.progress import unseen
 from xreset.files.storage import file_hash, measured, write_json, write_whole
 from xreset.physics.plugins import Device
 
 if TYPE_CHECKING:
     from xreset.eval.engines.agreement import Parity
-    from xreset.eval.engines.replay import TraceResult
     from xreset.eval.rollout import Engine
 else:  # a command has texts in place of these
-    Parity = TraceResult = Engine = Any
+    Parity = Engine = Any
 
 
 @obeys_rules
@@ -120,54 +119,4 @@ def compare_engines(
     )
     if json is not None:
         write_json(json, measured(asdict(found) | {"ok": not found.missed, "inputs": hashes}))
-    return found
-
-
-@obeys_rules
-def trace_engines(
-    source: str | Path,
-    engines: Annotated[str | Sequence[str], Option("engine")],
-    *,
-    reference: str = "mujoco",
-    object_name: Annotated[str | None, Option("object")] = None,
-    episode: NonNegativeInt = 0,
-    robot: str | Path | None = None,
-    meshes: str | Path | None = None,
-    seed: Seed = 0,
-    device: Device = "cpu",
-    out: Output = Path("runs/trace"),
-    progress: Callable[[str, float, int], None] = unseen,
-) -> TraceResult:
-    """Replay the same actions from the same state in several engines, and show when and by how much they diverge.
-
-    Args:
-        source: source of the actions. Demonstrations or robot motion: an open-loop grasp and lift. The trace of an
-            evaluation (eval/ENGINE.trace.npz): an episode of the policy.
-        engines: engine to compare with the reference, or several; the command's default: all that can be used here.
-        reference: engine that the others are compared with.
-        object_name: object, if the source has several; default: the first.
-        episode: which of the object's grasps or recorded episodes.
-        robot: name or folder of the robot; default: the policy's, or the file's.
-        meshes: folder of real meshes; default: what the policy was trained with, else the stand-ins.
-        seed: seed of the perturbed starts, which are the same in every engine.
-        device: where engines run that can use a GPU: cpu or cuda.
-        out: folder for trace.json.
-        progress: called with the name of each engine as it begins.
-
-    Raises:
-        DemoError: the file has no such object, grasp or episode.
-        XResetError: the reference itself does not stay finite, or an engine cannot be used here.
-    """
-    from xreset.eval import rollout
-    from xreset.eval.engines import actions, replay
-
-    base = rollout.engine(reference, device=device)
-    chosen = (engines,) if isinstance(engines, str) else dict.fromkeys(engines)
-    others = [rollout.engine(name, device=device) for name in chosen if name != reference]
-    progress("actions", 0, 0)
-    played = actions.from_file(Path(source), object_name, episode, robot=robot, meshes=meshes)
-    found = replay.trace(
-        played, base, others, seed=seed, progress=lambda name: progress(name, 0, 0)
-    )
-    write_json(Path(out) / "trace.json", measured(found.as_dict()))
     return found

@@ -23,7 +23,7 @@ COMMANDS = {
     "demos": "Import, synthesize, describe and select human demonstrations.",
     "objects": "Import meshes, and make random shapes.",
     "robots": "Check, import, place and judge robots.",
-    "engines": "Check and compare physics engines, and trace where they diverge.",
+    "engines": "Check and compare physics engines.",
     "retarget": "Turn human demonstrations into robot motion.",
     "resets": "Test robot states in physics and keep the stable ones.",
     "goals": "Give any object goals, without demonstrations.",
@@ -108,6 +108,7 @@ _MOVED = {
 _GONE = {
     "select": "evaluate checkpoints, xreset eval RUN/checkpoints/NUMBER.pt, and compare them with xreset report",
     "engines attribute": "xreset engines check measures engines, xreset stress what a policy tolerates",
+    "engines trace": "xreset engines compare plays grasps in several engines, xreset report films policies in them",
 }
 """Command of earlier versions -> what to do in place of it."""
 _RENAMED_IN = {

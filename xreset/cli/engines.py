@@ -1,4 +1,4 @@
-"""``xreset engines``: list, check, compare and trace physics engines."""
+"""``xreset engines``: list, check and compare physics engines."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ from xreset.physics.plugins import backend_names, backend_status
 
 if TYPE_CHECKING:
     from xreset.eval.engines.agreement import Parity
-    from xreset.eval.engines.replay import TraceResult
 
 
 def list_() -> None:
@@ -86,18 +85,8 @@ def _number(value: float | None, unit: str) -> str:
     return f"{value:.3g} {unit}" if unit else f"{100 * value:.1f} %"
 
 
-def _show_trace(found: TraceResult, options: Mapping[str, Any]) -> None:
-    from xreset.eval.engines import replay
-
-    console.print(replay.rich_table(found))
-    for sentence in replay.sentences(found):
-        console.print(sentence)
-    console.print(f"results in {options['out']}")
-
-
 COMMAND = {
     "": list_,
     "check": verb(verbs.check_engines, _show_checks, prepare=in_all_engines, engines=()),
     "compare": verb(verbs.compare_engines, _show_agreement, prepare=in_quick_engines, engines=()),
-    "trace": verb(verbs.trace_engines, _show_trace, prepare=in_all_engines, engines=()),
 }

@@ -114,7 +114,8 @@ class UrdfTest(InFolder):
             f"<collision>{origin}<geometry><{shape}/></geometry></collision>" for shape, _ in shapes
         )
         joint = FIXED.format(name="j", child="end").replace("fixed", "continuous")
-        tree = load_urdf(self.urdf(f'<link name="end">{collisions}</link>', joint))
+        visuals = collisions.replace("collision>", "visual>")
+        tree = load_urdf(self.urdf(f'<link name="end">{collisions}{visuals}</link>', joint))
         found = tree.link("end").collisions
         for shape, (_, expected) in zip(found, shapes, strict=True):
             self.assertEqual((shape.geometry.kind, shape.geometry.size), expected)

@@ -14,9 +14,9 @@ from dataclasses import field
 from functools import cached_property, lru_cache
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 from xml.etree import ElementTree
-from xml.etree.ElementTree import Element, SubElement
+from xml.etree.ElementTree import Element
 from xml.parsers import expat
 
 import numpy as np
@@ -320,7 +320,7 @@ def mesh_files(urdf: Path, kind: str = "collision") -> list[Path]:
 
 
 @lru_cache(maxsize=16)
-def _load(path: Path, changed: tuple[int, ...], visuals: bool = False) -> RobotTree:
+def _load(path: Path, changed: tuple[int, ...], visuals: bool) -> RobotTree:
     """Read a URDF and its meshes; their times of change [ns] make the cache read changed files again."""
     xml = parse_xml(path)
     if xml.tag == "mujoco":
@@ -332,12 +332,12 @@ def _load(path: Path, changed: tuple[int, ...], visuals: bool = False) -> RobotT
     try:
         with np.errstate(invalid="ignore"):  # check_tree refuses what is not finite
             xml.set("name", xml.get("name") or path.stem)
-            if visuals:
-                _use_visuals(xml, path)
             robot = _parsed(xml)
+            if visuals:
+                _use_visuals(robot, path)
             links = [_link(link, path) for link in robot.links]
             joints = [_joint(joint) for joint in robot.joints]
-        tree = _ordered(robot.name or path.stem, links, joints)
+        tree = _ordered(robot.name, links, joints)
         check_tree(tree)
     except RobotError as error:
         raise RobotError(f"{path} cannot be read as a URDF: {error}") from error
@@ -352,7 +352,7 @@ def _parsed(xml: Element) -> yourdfpy.Robot:
     """Return what yourdfpy reads from a URDF; capsules, which it does not know, become cylinders of negative radius."""
     import yourdfpy
 
-    for shape in xml.iterfind("link/collision/geometry/*"):
+    for shape in xml.iterfind("link/*/geometry/*"):
         if shape.get("radius", "").strip().startswith("-"):
             raise RobotError(f"a {shown(shape.tag)} has a negative radius.")
         if shape.tag == "capsule":
@@ -372,31 +372,26 @@ def _parsed(xml: Element) -> yourdfpy.Robot:
     ).robot
 
 
-def _use_visuals(xml: Element, path: Path) -> None:
+def _use_visuals(robot: yourdfpy.Robot, path: Path) -> None:
     """Make collision shapes of the visual ones in all bodies that have no collision shape, if the last body of a chain
     is such a one: then the file's collision shapes are not complete."""
-    joints = [joint for joint in xml.iterfind("joint") if joint.find("child") is not None]
-    moving = [joint for joint in joints if joint.get("type") != "fixed"]
-    carriers = {_end(j, "child"): _end(j, "parent") for j in joints if j.get("type") == "fixed"}
-    carrying = {_body(_end(joint, "parent"), carriers) for joint in moving}
-    visuals: dict[str, list[tuple[Element, Element]]] = {}
-    solid = set()
-    for link in xml.iterfind("link"):
-        name = _body(link.get("name", ""), carriers)
-        if link.find("collision") is not None:
-            solid.add(name)
-        for visual in link.iterfind("visual"):
-            visuals.setdefault(name, []).append((link, visual))
-    shown_only = {name: found for name, found in visuals.items() if name not in solid}
+    carriers = {joint.child: joint.parent for joint in robot.joints if joint.type == "fixed"}
+    carrying = {_body(joint.parent, carriers) for joint in robot.joints if joint.type != "fixed"}
+    solid = {_body(link.name, carriers) for link in robot.links if link.collisions}
+    shown_only: dict[str, list[tuple[yourdfpy.Link, Any]]] = {}
+    for link in robot.links:
+        body = _body(link.name, carriers)
+        if body in solid:
+            continue
+        for visual in link.visuals:
+            shown_only.setdefault(body, []).append((link, visual))
     if shown_only.keys() <= carrying:
         return
-    for name, found in shown_only.items():
-        there = [(link, visual) for link, visual in found if _is_there(visual, path)]
+    for body, found in shown_only.items():
+        there = [(link, visual) for link, visual in found if _is_there(visual.geometry.mesh, path)]
         # the end of a chain needs a shape: without its meshes, reading them says which file is missing
-        needed = there if there or name in carrying else found
-        for link, visual in needed:
-            shape = SubElement(link, "collision")
-            shape.extend(part for part in visual if part.tag in ("origin", "geometry"))
+        for link, visual in there if there or body in carrying else found:
+            link.collisions.append(visual)
 
 
 def _body(link: str, carriers: dict[str, str]) -> str:
@@ -406,15 +401,9 @@ def _body(link: str, carriers: dict[str, str]) -> str:
     return link
 
 
-def _is_there(visual: Element, path: Path) -> bool:
+def _is_there(mesh: yourdfpy.Mesh | None, path: Path) -> bool:
     """Return whether a shape needs no mesh, or its mesh can be found."""
-    mesh = visual.find("geometry/mesh")
-    return mesh is None or bool(find_mesh(mesh.get("filename", ""), path))
-
-
-def _end(joint: Element, end: str) -> str:
-    found = joint.find(end)
-    return "" if found is None else found.get("link", "")
+    return mesh is None or find_mesh(mesh.filename, path) is not None
 
 
 def _ordered(name: str, links: list[Link], joints: list[Joint]) -> RobotTree:
@@ -619,7 +608,7 @@ def _joint(joint: yourdfpy.Joint) -> Joint:
         raise RobotError(
             f"joint {name!r} has type {kind!r}; supported are revolute, continuous, prismatic and fixed."
         )
-    axis = np.array([1.0, 0, 0]) if joint.axis is None else np.asarray(joint.axis, dtype=float)
+    axis = np.asarray(joint.axis, dtype=float)
     if axis.shape != (3,):
         raise ValueError(f"joint {name!r} has an axis of {axis.size} numbers, expected 3 numbers")
     length = float(np.linalg.norm(axis))

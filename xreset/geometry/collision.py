@@ -8,7 +8,8 @@ Shape letters: B configurations, L links, G shapes, H support points, M states, 
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
+from functools import cache
 from itertools import combinations
 
 import numpy as np
@@ -135,20 +136,19 @@ class _LinkShapes:
         """[B, G, 3] centers of the balls, at poses [B, G, 4, 4] of the shapes' links."""
         return np.einsum("bgij,gj->bgi", T[..., :3, :3], self._center) + T[..., :3, 3]
 
-    def placed(self, T: np.ndarray, used: np.ndarray) -> dict[tuple[int, int], tuple]:
-        """Return shapes as coal wants them, by (configuration, shape).
+    def placed(self, T: np.ndarray) -> Callable[[int, int], tuple]:
+        """Return a function of configuration and shape that gives the shape as coal wants it; each is made once.
 
         Args:
             T: [B, G, 4, 4] poses of the shapes' links.
-            used: [B, G] bool: the shapes that are wanted.
         """
-        configuration, shape = np.nonzero(used)
-        poses = T[configuration, shape] @ self.T_link_shape[shape]
-        transform = self.coal.Transform3s
-        placed = {}
-        for b, g, pose in zip(configuration.tolist(), shape.tolist(), poses, strict=True):
-            placed[b, g] = (self.geometry[g], transform(pose[:3, :3], pose[:3, 3]))
-        return placed
+
+        @cache
+        def shape_of(configuration: int, shape: int) -> tuple:
+            pose = T[configuration, shape] @ self.T_link_shape[shape]
+            return self.geometry[shape], self.coal.Transform3s(pose[:3, :3], pose[:3, 3])
+
+        return shape_of
 
 
 class SelfCollision:
@@ -221,13 +221,10 @@ class SelfCollision:
             centers = shapes.centers(T)
             gap = np.linalg.norm(centers[:, first] - centers[:, second], axis=-1)
             row, pair = np.nonzero(gap < reach)
-            used = np.zeros(T.shape[:2], dtype=bool)
-            used[row, first[pair]] = True
-            used[row, second[pair]] = True
-            placed = shapes.placed(T, used)
+            placed = shapes.placed(T)
             near = zip(row.tolist(), first[pair].tolist(), second[pair].tolist(), strict=True)
             for b, i, j in near:
-                distance = distance_of(*placed[b, i], *placed[b, j])
+                distance = distance_of(*placed(b, i), *placed(b, j))
                 if distance < margin:
                     key = (start + b, shapes.link[i], shapes.link[j])
                     found[key] = min(distance, found.get(key, margin))
@@ -411,12 +408,10 @@ def _overlaps(
     """
     distance_of, result = _signed_distance(shapes.coal)
     near, piece = pieces.near(shapes.centers(T).reshape(-1, 3), np.tile(shapes.radius, len(T)))
-    used = np.zeros(T.shape[:2], dtype=bool)
-    used.flat[near] = True
-    placed = shapes.placed(T, used)
+    placed = shapes.placed(T)
     rows, own = np.divmod(near, T.shape[1])
     for row, shape, other in zip(rows.tolist(), own.tolist(), piece.tolist(), strict=True):
-        distance = distance_of(*placed[row, shape], *pieces.placed[other])
+        distance = distance_of(*placed(row, shape), *pieces.placed[other])
         if distance < 0:
             # coal's normal points from the first shape to the second
             outward = -result.normal

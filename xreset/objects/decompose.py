@@ -70,9 +70,7 @@ _OUTSIDE = 5e-4
 _NEAREST = 8
 """Triangles of a surface that the distance of a point is computed from."""
 _BATCH = 2000
-"""Triangles or vertices whose distance is computed together."""
-_JOGGLE = 1e-6
-"""More than qhull moves vertices to make them span a volume [m]."""
+"""Triangles whose distances are computed together."""
 _LEAST_EFFORT = 2000
 """Triangles that the measure of a pair of pieces counts for at least: its points take time in any case."""
 _TOUCH = 2e-4
@@ -609,19 +607,10 @@ def limited_hull(points: np.ndarray) -> Shape:
         return full
     along = vertices @ np.vstack((np.eye(3), _DIAGONALS)).T
     chosen = np.unique((along.argmin(axis=0), along.argmax(axis=0))).tolist()
-    outside = np.full(len(vertices), np.inf)
     while len(chosen) < _MAX_VERTICES:
         # joggled: the first few may be coplanar
         planes = ConvexHull(vertices[chosen], qhull_options="QJ").equations
+        outside = plane_heights(vertices, planes).max(axis=1)
         outside[chosen] = -np.inf
-        order = np.argsort(-outside, kind="stable")[: len(vertices) - len(chosen)]
-        farthest = -np.inf
-        for begin in range(0, len(order), _BATCH):
-            part = order[begin : begin + _BATCH]
-            # the hull grows, so the heights above an earlier hull bound those above this one
-            if outside[part[0]] < farthest - _JOGGLE:
-                break
-            outside[part] = plane_heights(vertices[part], planes).max(axis=1)
-            farthest = max(farthest, float(outside[part].max()))
         chosen.append(outside.argmax())
     return hull(vertices[chosen])

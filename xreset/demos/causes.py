@@ -16,7 +16,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from xreset.files.checks import frozen
-from xreset.geometry.shapes import transformed
+from xreset.geometry.shapes import transform, transformed
 from xreset.geometry.surface import Surface
 from xreset.objects.rest import resting_faces
 from xreset.spec import TableSpec
@@ -111,6 +111,11 @@ class Recording:
     """Surface of the object; None: unknown."""
     camera: np.ndarray | None = None
     """[4, 4] pose of the camera in the table frame that positions were converted with; None: none, or unknown."""
+
+    @property
+    def T_table(self) -> np.ndarray:
+        """[4, 4] pose of the frame of the recording's own numbers in the table frame."""
+        return np.eye(4) if self.camera is None else self.camera
 
     @cached_property
     def seen(self) -> np.ndarray:
@@ -456,34 +461,29 @@ def _axes(r: Recording) -> Iterator[Cause]:
         ("x", "y", -90),
         ("-x", "y", 90),
     ):
-        matrix = np.eye(4)
-        matrix[:3, :3] = Rotation.from_euler(axis, angle, degrees=True).as_matrix()
         text = f"The {name} axis may point up: turn all poses so that z does."
         for heading in (0, 180, 90, -90):
-            turned = _about_z(heading) @ matrix
+            turned = _turn("z", heading) @ _turn(axis, angle)
             yield Cause(text, _placed(r, turned, turned))
+    center = transform(np.eye(3), (*TableSpec().center, 0.0))
     for angle in (180, 90, -90):
-        matrix = _about_z(angle)
+        turn = _turn("z", angle)
         text = (
             f"The table's frame may be turned by {abs(angle)} degrees about z: the person should be at +y. Turn all"
             " poses."
         )
-        yield Cause(text, _placed(r, matrix, matrix))
-        center = np.eye(4)
-        center[:2, 3] = TableSpec().center
-        about_center = center @ matrix @ np.linalg.inv(center)
-        yield Cause(text, _placed(r, about_center, about_center))
+        for matrix in (turn, center @ turn @ np.linalg.inv(center)):
+            yield Cause(text, _placed(r, matrix, matrix))
 
 
-def _about_z(degrees: float) -> np.ndarray:
-    matrix = np.eye(4)
-    matrix[:3, :3] = Rotation.from_euler("z", degrees, degrees=True).as_matrix()
-    return matrix
+def _turn(axis: str, degrees: float) -> np.ndarray:
+    """[4, 4]"""
+    return transform(Rotation.from_euler(axis, degrees, degrees=True).as_matrix(), np.zeros(3))
 
 
 def _mirrors(r: Recording) -> Iterator[Cause]:
     """Yield mirror images of the hand, in the camera's frame and in the table's."""
-    T = np.eye(4) if r.camera is None else r.camera
+    T = r.T_table
     for axis in range(3):
         mirror = np.eye(4)
         mirror[axis, axis] = -1.0
@@ -496,7 +496,7 @@ def _mirrors(r: Recording) -> Iterator[Cause]:
 
 def _orders(r: Recording) -> Iterator[Cause]:
     """Yield other orders of the numbers of the object's quaternions."""
-    to_table = _turn_to_table(r)
+    to_table = Rotation.from_matrix(r.T_table[:3, :3])
     numbers = (to_table.inv() * r.turn).as_quat(scalar_first=True)
     for order, shift in (("(x, y, z, w)", 1), ("(w, x, y, z)", -1)):
         quats = np.roll(numbers, shift, axis=1)
@@ -508,28 +508,22 @@ def _orders(r: Recording) -> Iterator[Cause]:
 
 def _inverses(r: Recording) -> Iterator[Cause]:
     """Yield inverse orientations and poses of the object."""
-    to_table = _turn_to_table(r)
-    T = np.eye(4) if r.camera is None else r.camera
+    to_table = Rotation.from_matrix(r.T_table[:3, :3])
     inverse = (to_table.inv() * r.turn).inv()
-    pos = transformed(r.pos, np.linalg.inv(T))
+    pos = transformed(r.pos, np.linalg.inv(r.T_table))
     yield Cause(
         "The object's orientations may be inverted: transpose its matrices, or negate x, y and z of its quaternions.",
         replace(r, turn=to_table * inverse),
     )
     yield Cause(
         "The object's poses may be inverted, those of the camera in the object's frame: invert them.",
-        replace(r, turn=to_table * inverse, pos=transformed(-inverse.apply(pos), T)),
+        replace(r, turn=to_table * inverse, pos=transformed(-inverse.apply(pos), r.T_table)),
     )
-
-
-def _turn_to_table(r: Recording) -> Rotation:
-    return Rotation.identity() if r.camera is None else Rotation.from_matrix(r.camera[:3, :3])
 
 
 def _units(r: Recording) -> Iterator[Cause]:
     """Yield other units of the object's positions."""
-    T = np.eye(4) if r.camera is None else r.camera
-    own = transformed(r.pos, np.linalg.inv(T))
+    own = transformed(r.pos, np.linalg.inv(r.T_table))
     for scale, unit in (
         (1e3, "a thousandth"),
         (1e-3, "a thousand times"),
@@ -541,7 +535,7 @@ def _units(r: Recording) -> Iterator[Cause]:
         yield Cause(
             f"The object's positions may be in another unit: their numbers are {unit} of what they should be. Use one"
             " unit for hand and object.",
-            replace(r, pos=transformed(scale * own, T)),
+            replace(r, pos=transformed(scale * own, r.T_table)),
         )
 
 

@@ -126,14 +126,11 @@ class Finding:
     """Number of sequences that were examined."""
 
     def __str__(self) -> str:
-        where = (
-            f"{len(self.sequences)} of {self.examined} sequences, the first is {self.sequences[0]}"
-        )
-        return (
-            f"{where}: {self.found} {self.cause}"
-            if self.examined > 1
-            else f"{self.found} {self.cause}"
-        )
+        where = ""
+        if self.examined > 1:
+            count = f"{len(self.sequences)} of {self.examined} sequences"
+            where = f"{count}, the first is {self.sequences[0]}: "
+        return f"{where}{self.found} {self.cause}"
 
 
 def examine(
@@ -228,10 +225,10 @@ def _recording(
 
 def _findings(r: Recording) -> Iterator[Finding]:
     """Yield what is found in one sequence. A hand that is none, or in another convention, hides everything else."""
-    hand = list(_of_hand(r)) if r.seen.any() else []
-    yield from hand
-    if any(finding.wrong for finding in hand):
-        return
+    for finding in _of_hand(r):
+        yield finding
+        if finding.wrong:
+            return
     yield from _of_place(r)
     yield from _of_motion(r)
 
@@ -249,11 +246,8 @@ def _of_place(r: Recording) -> Iterator[Finding]:
             cause=cause,
         )
     elif cause := unnoticed_cause(r):
-        yield Finding(
-            name="together",
-            wrong=True,
-            found="Hand and object do not move together while the object moves.",
-            cause=cause,
+        yield _error(
+            "together", "Hand and object do not move together while the object moves.", cause
         )
     else:
         yield from _doubts_of_place(r)
@@ -281,73 +275,67 @@ def _doubts_of_place(r: Recording) -> Iterator[Finding]:
 
 
 def _of_hand(r: Recording) -> Iterator[Finding]:
-    """Yield what is found about the hand's shape. The first thing that is certainly wrong is the last one."""
+    """Yield what is found about the hand's shape. What follows after an error means nothing."""
+    if not r.seen.any():
+        return
     points = r.points[r.seen]
     size = np.linalg.norm(points - points[:, :1], axis=2).max(axis=1)
     absent = size < _ONE_POINT * (np.median(size) > _ONE_POINT)
     if absent.any():
-        yield Finding(
-            name="absent",
-            wrong=True,
-            found=f"In {np.count_nonzero(absent)} of {len(r.seen)} frames all keypoints are at one point.",
-            cause="Leave cells empty, or write NaN, where the hand was not seen; 0 and -1 are places.",
+        yield _error(
+            "absent",
+            f"In {np.count_nonzero(absent)} of {len(r.seen)} frames all keypoints are at one point.",
+            "Leave cells empty, or write NaN, where the hand was not seen; 0 and -1 are places.",
         )
-        return
     bones = bone_lengths(points)
     if misread := _order_problem(points):
-        yield Finding(
-            name="order",
-            wrong=True,
-            found=misread,
-            cause="State the order (--order), or put the keypoints into the order of xreset.spec.KEYPOINTS.",
+        yield _error(
+            "order",
+            misread,
+            "State the order (--order), or put the keypoints into the order of xreset.spec.KEYPOINTS.",
         )
-        return
     palm = float(np.median(np.linalg.norm(points[:, 9] - points[:, 0], axis=1)))
     if not _PALM[0] <= palm <= _PALM[1]:
-        yield Finding(
-            name="size",
-            wrong=True,
-            found=f"From the wrist to the middle finger's knuckle it is {1e3 * palm:.3g} mm, expected 60 to 140 mm.",
-            cause="Is the unit right (--units)? Keypoints must be metric and in space, not those of an image.",
+        yield _error(
+            "size",
+            f"From the wrist to the middle finger's knuckle it is {1e3 * palm:.3g} mm, expected 60 to 140 mm.",
+            "Is the unit right (--units)? Keypoints must be metric and in space, not those of an image.",
         )
-        return
     spread = np.median(bones.std(axis=0) / bones.mean(axis=0))
     if spread > _BONE_SPREAD:
-        yield Finding(
-            name="bones",
-            wrong=True,
-            found=f"The lengths of the hand's bones change by {spread:.0%} (standard deviation).",
-            cause="The keypoints are not metric. MediaPipe's normalised landmarks, for example, are coordinates of the"
+        yield _error(
+            "bones",
+            f"The lengths of the hand's bones change by {spread:.0%} (standard deviation).",
+            "The keypoints are not metric. MediaPipe's normalised landmarks, for example, are coordinates of the"
             " image.",
         )
-        return
     long = bones.max(axis=1) > _LONGEST_BONE
     if long.any():
         frame = int(np.flatnonzero(r.seen)[np.argmax(long)])
-        yield Finding(
-            name="bones",
-            wrong=True,
-            found=f"In {np.count_nonzero(long)} of {len(r.seen)} frames, first in frame {frame}, a bone of the hand is"
+        yield _error(
+            "bones",
+            f"In {np.count_nonzero(long)} of {len(r.seen)} frames, first in frame {frame}, a bone of the hand is"
             f" {length_text(float(bones.max()))} long.",
-            cause="A keypoint that was not seen may be written as a number: leave its cells empty, or write NaN.",
+            "A keypoint that was not seen may be written as a number: leave its cells empty, or write NaN.",
         )
-        return
-    if centered := _centered_problem(r):
-        yield centered
-        return
+    if fixed := _fixed_point(r):
+        yield _error(
+            "place of the hand",
+            f"{fixed} stays at one point while the object moves.",
+            "The keypoints are relative to the hand, like MediaPipe's world landmarks or a hand model's joints. Add"
+            " the hand's position in the camera's or the table's frame first.",
+        )
     curl, thumb = _to_palm(points, r.side)
     if curl < -_CURL or thumb < _THUMB:
         does = f"its fingers bend {-1e3 * curl:.0f} mm towards"
         if curl >= -_CURL:
             does = f"its thumb's tip is {-1e3 * thumb:.0f} mm to"
-        yield Finding(
-            name="side",
-            wrong=True,
-            found=f"As a {r.side} hand {does} the back of the hand.",
-            cause="It is the other hand (--side), or the coordinates are left-handed, as Unity's are: negate one axis"
-            " of keypoints and poses.",
+        yield _error(
+            "side",
+            f"As a {r.side} hand {does} the back of the hand.",
+            "It is the other hand (--side), or the coordinates are left-handed, as Unity's are: negate one axis of"
+            " keypoints and poses.",
         )
-        return
     yield from _doubts_of_hand(r, bones)
 
 
@@ -383,25 +371,19 @@ def _order_problem(points: np.ndarray) -> str:
     return ""
 
 
-def _centered_problem(r: Recording) -> Finding | None:
-    """Return the finding that the hand's place is unknown."""
+def _fixed_point(r: Recording) -> str:
+    """Return what of the hand stays at one point while the object moves; empty if nothing does."""
     points = r.points[r.seen]
     still = np.ptp(r.pos[r.seen], axis=0).max() < MOVED
     if len(points) < 2 or still:
-        return None
+        return ""
     for what, at in (
-        ("The wrist stays at one point", points[:, 0]),
-        ("The center of the hand stays at one point", points.mean(axis=1)),
+        ("The wrist", points[:, 0]),
+        ("The center of the hand", points.mean(axis=1)),
     ):
         if np.ptp(at, axis=0).max() < _ONE_PLACE:
-            return Finding(
-                name="place of the hand",
-                wrong=True,
-                found=f"{what} while the object moves.",
-                cause="The keypoints are relative to the hand, like MediaPipe's world landmarks or a hand model's"
-                " joints. Add the hand's position in the camera's or the table's frame first.",
-            )
-    return None
+            return what
+    return ""
 
 
 def _to_palm(points: np.ndarray, side: str) -> tuple[float, float]:
@@ -480,12 +462,8 @@ def _doubts_of_speed(r: Recording, jumps: np.ndarray) -> Iterator[Finding]:
             f"The hand does not move at all for {longest:.1f} s while the object moves.",
             "The tracker may have lost it: leave the hand's cells empty in these frames.",
         )
-    elif moves.any() and (copies := (same & moves).sum() / moves.sum()) > _COPIES:
-        yield _doubt(
-            "copies",
-            f"In {copies:.0%} of the frames in which the object moves, the hand is an exact copy of the frame before.",
-            "It may have been recorded at a lower rate: remove the copies, and state the times.",
-        )
+    else:
+        yield from _copies("copies", "the hand", same, moves)
 
 
 def _of_motion(r: Recording) -> Iterator[Finding]:
@@ -544,6 +522,21 @@ def _of_motion(r: Recording) -> Iterator[Finding]:
         )
 
 
+def _copies(name: str, what: str, same: np.ndarray, moves: np.ndarray) -> Iterator[Finding]:
+    """Yield a doubt about frames that are the same as the frame before [F-1] while the object moves [F-1]."""
+    share = (same & moves).sum() / max(moves.sum(), 1)
+    if share > _COPIES:
+        yield _doubt(
+            name,
+            f"In {share:.0%} of the frames in which the object moves, {what} is an exact copy of the frame before.",
+            "It may have been recorded at a lower rate: remove the copies, and state the times.",
+        )
+
+
+def _error(name: str, found: str, cause: str) -> Finding:
+    return Finding(name=name, wrong=True, found=found, cause=cause)
+
+
 def _doubt(name: str, found: str, cause: str) -> Finding:
     return Finding(name=name, wrong=False, found=found, cause=cause)
 
@@ -576,13 +569,8 @@ def _doubts_of_tracking(r: Recording) -> Iterator[Finding]:
     """Yield doubts about an object that trembles, or whose poses repeat while it moves."""
     quats = r.turn.as_quat()
     same = (r.pos[1:] == r.pos[:-1]).all(axis=1) & (quats[1:] == quats[:-1]).all(axis=1)
-    moves = _moves(r)
-    if moves.any() and (copies := (same & moves).sum() / moves.sum()) > _COPIES:
-        yield _doubt(
-            "object copies",
-            f"In {copies:.0%} of the frames in which the object moves, its pose is an exact copy of the frame before.",
-            "It may have been recorded at a lower rate: remove the copies, and state the times.",
-        )
+    if copies := list(_copies("object copies", "its pose", same, _moves(r))):
+        yield from copies
         return
     place = np.linalg.norm(np.diff(r.pos, n=2, axis=0), axis=1) / np.sqrt(6.0)
     angle = np.linalg.norm(np.diff(r.step_turn.as_rotvec(), axis=0), axis=1) / np.sqrt(6.0)

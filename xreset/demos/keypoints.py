@@ -466,10 +466,9 @@ def _wrist(points: np.ndarray, side: str) -> Rotation:
     """Fit wrist and knuckles of an average hand to keypoints [F, 21, 3] (Kabsch's algorithm); F orientations of MANO's
     root."""
     template = hand.keypoints(hand.RELAXED, side)[_KNUCKLES]
-    found = points[:, _KNUCKLES]
-    covariance = np.einsum(
-        "ki,fkj->fij", template - template.mean(axis=0), found - found.mean(axis=1, keepdims=True)
-    )
-    U, _, Vt = np.linalg.svd(covariance)
-    Vt[:, 2] *= np.linalg.det(U @ Vt)[:, None]
-    return Rotation.from_matrix((U @ Vt).transpose(0, 2, 1))
+    template -= template.mean(axis=0)
+    turns = []
+    for found in points[:, _KNUCKLES]:
+        turn, _ = Rotation.align_vectors(found - found.mean(axis=0), template)
+        turns.append(turn)
+    return Rotation.concatenate(turns)

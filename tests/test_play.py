@@ -196,8 +196,6 @@ class Played(InFolder):
         self.session.step()
 
     def test_another_robot_begins_with_its_own_policy_and_shape(self):
-        from xreset.eval.play.page import Page
-
         page = Page(self.session, port=8965)
         self.addCleanup(page.close)
         self.addCleanup(self.session.choose_policy, "many-objects")
@@ -217,6 +215,19 @@ class Played(InFolder):
                 targets = [moment.joint_target for moment in self.session.history]
                 self.assertEqual(np.shape(targets)[1], len(spec.joints))
                 self.assertTrue(np.ptp(targets, axis=0).any())
+
+    def test_a_robot_of_which_no_policy_ships_rests(self):
+        page = Page(self.session, port=8970)
+        self.addCleanup(page.close)
+        self.addCleanup(self.session.choose_policy, "many-objects")
+        page._robot_name.value = "openarm"
+        with patch("xreset.eval.play.page.shipped_name", return_value=None):
+            page._open_chosen()
+        spec = self.session.policy.robot
+        self.assertEqual((spec.name, page._policy.value), ("openarm", "zero"))
+        self.steps(0.5)
+        targets = [moment.joint_target for moment in self.session.history]
+        self.assertFalse(np.ptp(targets, axis=0).any())
 
     def test_film_and_trace(self):
         session = self.session

@@ -173,6 +173,12 @@ class ShippedTest(WithPolicy):
             "70 %",
         ):
             self.assertIn(part, out)
+        self.assertEqual(succeeds("policies", "skilled"), out)
+        self.assertIn("xreset eval skilled --demos DEMOS", out, "without a graph it is not played")
+        (shipped.FOLDER / "skilled.graph").touch()
+        self.assertIn("xreset play skilled", succeeds("policies", "skilled"))
+        words = "Unknown policy 'nobody'. Choose from: skilled."
+        self.assertIn(words, refused("policies", "skilled", "nobody"))
         card.write_text(CARD.replace("card/1", "card/9"))
         self.assertIn("states schema", refused("policies", "list"))
 
@@ -187,7 +193,7 @@ class ShippedTest(WithPolicy):
         self.assertEqual(load_policy("openarm").name, "skilled")
         self.assertEqual(default_policy(robot_folder("openarm")), "skilled")
         self.assertEqual(shipped.run_folder("openarm"), Path("runs/skilled"))
-        self.assertIn("openarm, whose name means this policy", succeeds("policies", "list"))
+        self.assertIn("openarm, whose name means this policy", succeeds("policies", "openarm"))
         other = "for the robot 'ur7e-robotiq', only for openarm: train one with xreset run DEMOS"
         for command in (
             ("play", "--robot", "ur7e-robotiq"),

@@ -2,15 +2,32 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from xreset.cli._terminal import console, show_table
-from xreset.policy.shipped import card, shipped, shipped_name
+from xreset.cli._verbs import verb
+from xreset.errors import PolicyError
+from xreset.policy.shipped import card, shipped, shipped_graphs, shipped_name
 
 
-def policies() -> None:
-    """List the policies that ship with xreset. Every command with a policy argument accepts their names."""
+def policies(names: Sequence[str] = ()) -> None:
+    """List the policies that ship with xreset. Every command with a policy argument accepts their names.
+
+    Args:
+        names: policies to show, or robots whose name means a policy; default: all.
+    """
     from xreset.policy.onnx_policy import OnnxPolicy
 
-    for name, file in shipped().items():
+    files = shipped()
+    graphs = shipped_graphs()  # a policy with cameras has none, and cannot be played
+    chosen = []
+    for given in names or files:
+        name = shipped_name(given)
+        if name is None:
+            raise PolicyError(f"Unknown policy {given!r}. Choose from: {', '.join(files)}.")
+        chosen.append(name)
+    for name in dict.fromkeys(chosen):
+        file = files[name]
         contract = OnnxPolicy(file).contract
         about = card(file)
         console.print(f"{name}: {about.about}")
@@ -20,6 +37,8 @@ def policies() -> None:
             "data": about.data,
             "recipe": about.recipe,
             "licence": f"{about.licence}; {file.stat().st_size / 1e6:.1f} MB",
+            "try it": "xreset "
+            + (f"play {name}" if name in graphs else f"eval {name} --demos DEMOS"),
         }
         for what, text in facts.items():
             console.print(f"  {what + ':':9} {text}")
@@ -36,7 +55,7 @@ def _robot(robot: str, policy: str) -> str:
     """Return the name of a policy's robot, and whether this name means the policy."""
     if shipped_name(robot) != policy:
         return robot
-    return f"{robot}, whose name means this policy (xreset play --robot {robot})"
+    return f"{robot}, whose name means this policy"
 
 
 def _objects(trained: tuple[str, ...]) -> str:
@@ -48,4 +67,4 @@ def _objects(trained: tuple[str, ...]) -> str:
     return ", ".join([*known, f"{others} other shapes"] if others else known)
 
 
-COMMAND = policies
+COMMAND = verb(policies)

@@ -85,7 +85,7 @@ class GraspsTest(TestCase):
         lift = ABOVE + np.array([0, 0, 0.07])
         far = lift + np.array([0, -2.0, 0])
         found = self.reasons(post, [lift, lift, far], [lift + np.array([0, 0, 0.15]), far, lift])
-        self.assertEqual(found, ["", "goal out of reach", "start out of reach"])
+        self.assertEqual(found, ["", "goal out of reach", "grasps out of reach"])
         plate = block(0.20, 0.20, 0.02)
         low = ABOVE + np.array([0, 0, 0.01])
         # a jaw would have to come from the side, with a finger in the table

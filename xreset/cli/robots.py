@@ -82,7 +82,10 @@ def _show_places(found: Sequence[Finalist], options: Mapping[str, Any]) -> None:
     show_table(table, title="placements, the best one first")
     best = found[0].robot
     console.print(f"arm at home in the best: {_digits(best.home[best.arm_indices])}")
-    console.print(f"of {found[0].frames} annotated frames of {found[0].sequences} sequences")
+    console.print(
+        f"follows: share of {found[0].frames} annotated frames of {found[0].sequences} sequences, one after another; "
+        "reaches: of a sample of their wrist poses, each on its own"
+    )
     if options["write"]:
         console.print(f"wrote {robot_folder(options['robot']) / 'robot.toml'}")
 

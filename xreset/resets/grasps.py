@@ -61,14 +61,15 @@ _AT_ONCE = 24
 """Grasps whose inverse kinematics is solved at a time for each demonstration."""
 
 Loss = Literal[
-    "no grasp", "too wide", "no approach", "start out of reach", "joint limit", "goal out of reach",
+    "no grasp", "too wide", "no approach", "grasps out of reach", "joint limit", "goal out of reach",
     "table at the goal", "collision at the goal",
 ]  # fmt: skip
 """Why a demonstration cannot be followed. ``no grasp``: a hand that is no jaw presses on the object in no lifted state
 of the bank. ``too wide``: no two points of the object that face away from each other are
 as near as the jaw opens. ``no approach``: such points exist, and the hand would be in the object or in the table at
-each of them. ``start out of reach``: the arm reaches none of these grasps. The others: what keeps most of the grasps
-that the arm reaches at the start from the goal."""
+each of them. ``grasps out of reach``: at the start, the arm reaches none of these grasps within its joint limits, clear
+of the table and of itself. The others: what keeps most of the grasps that the arm reaches at the start from the
+goal."""
 
 _AT_GOAL: dict[str, Loss] = {
     "joint limit": "joint limit",
@@ -337,7 +338,7 @@ def _loss(hand: HandModel, arm: ArmModel, grasps: Grasps, start: Tensor, goal: T
             return ""
         found += at_goal.tolist()
     if not found:
-        return "start out of reach"
+        return "grasps out of reach"
     most = REASONS[int(np.bincount(found).argmax())]
     return _AT_GOAL.get(most, "goal out of reach")
 

@@ -121,8 +121,7 @@ def import_with_notes(path: str | Path, name: str) -> Import:
     if not mesh.is_volume:
         notes.append(_how_closed(mesh, pieces))
     mass, mass_source = _mass(path, name, own, pieces.volume, notes)
-    if mesh.is_volume:
-        _check_density(path, mesh, mass)
+    _check_density(path, mesh, mass)
     com = pieces.com
     inertia = pieces.inertia * mass
     if own.density is None and mesh.is_volume and mass / pieces.volume < _HOLLOW:
@@ -175,8 +174,9 @@ def _mass(
 
 
 def _check_density(path: Path, mesh: trimesh.Trimesh, mass: float) -> None:
-    """Refuse, with ``ObjectError``, a closed mesh of another unit or a mass that no object of its size has."""
-    density = mass / mesh.volume
+    """Refuse, with ``ObjectError``, a mesh of another unit or a mass that no object of its size has."""
+    # an open mesh is at most as large as its convex hull
+    density = mass / (mesh if mesh.is_volume else mesh.convex_hull).volume
     if MASSES[0] <= mass <= MASSES[1] and DENSITIES[0] <= density <= DENSITIES[1]:
         return
     raise ObjectError(

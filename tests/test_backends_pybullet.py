@@ -66,9 +66,16 @@ class PybulletTest(EngineChecks, TestCase):
                     pieces.append(hull(half, moved))
                 self.assertAlmostEqual(opening(*pieces), box, delta=5e-5)
 
-    def test_the_import_prints_nothing(self):
+    def test_the_engine_prints_nothing(self):
+        """It prints its build time, and a warning for each rounded axis of a robot: the LEAP hand has some."""
         code = (
-            "from xreset.backends.pybullet import PybulletBackend as B; print(B.engine_version())"
+            "from dataclasses import replace\n"
+            "import xreset\n"
+            "from xreset.backends.conformance.scene import scene\n"
+            "from xreset.backends.pybullet import PybulletBackend\n"
+            "print(PybulletBackend.engine_version())\n"
+            "robot = xreset.load_robot('xarm7-leap')\n"
+            "PybulletBackend(replace(scene(), robot=robot), 1).close()\n"
         )
         done = subprocess.run(
             [sys.executable, "-c", code], capture_output=True, text=True, timeout=120

@@ -120,7 +120,7 @@ def property_of(option: str) -> Property:
     return _BY_OPTION.get(option) or Property(name=option.replace("-", " "), unit="")
 
 
-def chosen(
+def chosen_properties(
     wanted: str | Sequence[str], default: Sequence[Property] = SWEPT
 ) -> tuple[Property, ...]:
     """Return the wanted properties, given as ``NAME`` or ``NAME=VALUE,VALUE...``; ``default`` if ``wanted`` is empty.

@@ -9,57 +9,91 @@ import logging
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pandas as pd
 
 from xreset.errors import XResetError
-from xreset.eval.conditions import Condition, Property
+from xreset.eval.conditions import Condition, property_of
 from xreset.eval.policy_spec import PolicySpec
 from xreset.eval.results import (
     EvalResult,
+    Evaluation,
     Trace,
     episode_table,
     read_result,
     write_result,
 )
 from xreset.eval.rollout import Engine, Trial, roll_out
-from xreset.files.progress import Progress, unseen
+from xreset.files.progress import NamedProgress, Progress, unseen
+from xreset.files.storage import claim_folder
 from xreset.physics.plugins import backend_class
-
-
-def can_set(engine: Engine, prop: Property) -> bool:
-    """Return whether an engine can set a property."""
-    return prop.needs is None or prop.needs in backend_class(engine.name).capabilities
 
 
 def play(
     policy: PolicySpec,
     trial: Trial,
-    engine: Engine,
+    engines: Sequence[Engine],
     conditions: Sequence[Condition],
     folder: Path,
     *,
     episodes: int,
     on_robot: bool = False,
-    left_out: dict[str, str] | None = None,
-    progress: Progress = unseen,
-) -> EvalResult:
-    """Play every demonstration under every condition in one engine, and write the result and the recorded episodes; a
-    robot's control loop records none.
+    progress: NamedProgress = unseen,
+) -> Evaluation:
+    """Play every demonstration under every condition in every engine, and write the results and the recorded episodes;
+    a robot's control loop records none.
 
     Args:
         policy: the policy.
         trial: what is played; conditions replace its task.
-        engine: the engine.
-        conditions: the first one is recorded.
-        folder: where the result is written.
+        engines: the engines. Each leaves out the properties that it cannot set.
+        conditions: the first one, in which nothing is changed, is recorded.
+        folder: where the results are written.
         episodes: episodes of each demonstration, each with another perturbation, the same under every condition.
         on_robot: whether a robot's control loop plays, as faults need.
-        left_out: property that has no condition -> why.
-        progress: called with what is done and what is to be done in all; for one condition control steps, else
-            conditions.
+        progress: called with the engine, what is done and what is to be done in all; for one condition control steps,
+            else conditions.
     """
+    found = Evaluation()
+    found.folder = folder
+    with claim_folder(folder):
+        for engine in engines:
+            _warn_of_replaced(folder / f"{engine.name}.json", trial)
+        for engine in engines:
+            result, traces = _play_in(
+                engine,
+                policy,
+                trial,
+                conditions,
+                episodes=episodes,
+                on_robot=on_robot,
+                progress=partial(progress, engine.name),
+            )
+            write_result(folder, result, traces, trial.robot.joint_names)
+            found.append(result)
+    return found
+
+
+def _can_set(engine: Engine, condition: Condition) -> bool:
+    needed = property_of(condition.property).needs
+    return needed is None or needed in backend_class(engine.name).capabilities
+
+
+def _play_in(
+    engine: Engine,
+    policy: PolicySpec,
+    trial: Trial,
+    conditions: Sequence[Condition],
+    *,
+    episodes: int,
+    on_robot: bool,
+    progress: Progress,
+) -> tuple[EvalResult, tuple[Trace, ...]]:
+    """Return the result in one engine, and the recorded episodes; arguments as for :func:`play`."""
+    played = [each for each in conditions if _can_set(engine, each)]
+    skipped = [each.property for each in conditions if not _can_set(engine, each)]
     tables = []
     stopped: Counter[str] = Counter()
     traces: tuple[Trace, ...] = ()
@@ -71,7 +105,7 @@ def play(
         from xreset.runtime import Controller
 
         controller = Controller(policy.graph, policy.name)
-    for i, condition in enumerate(conditions):
+    for i, condition in enumerate(played):
         changed = replace(trial, task=condition.task)
         if controller is None:
             rollouts = roll_out(
@@ -79,7 +113,7 @@ def play(
                 engine,
                 changed,
                 episodes=episodes,
-                progress=progress if len(conditions) == 1 else unseen,
+                progress=progress if len(played) == 1 else unseen,
             )
         else:
             rollouts = roll_out_on_robot(
@@ -94,8 +128,8 @@ def play(
             speed = rollouts.control_steps_per_second
         stopped.update(rollouts.stopped)
         tables.append(episode_table(rollouts.episodes, condition.property, condition.value))
-        if len(conditions) > 1:
-            progress(i + 1, len(conditions))
+        if len(played) > 1:
+            progress(i + 1, len(played))
     vision = trial.task.vision
     result = EvalResult(
         engine=engine.name,
@@ -109,12 +143,11 @@ def play(
         unseen=policy.unseen(trial.names),
         vision=vision if vision.cameras else None,
         episode_seconds=_length(trial),
-        left_out=left_out or {},
+        left_out=dict.fromkeys(skipped, f"{engine.name} cannot set it"),
         stopped=dict(stopped),
         episodes=pd.concat(tables, ignore_index=True),
     )
-    write_result(folder, result, traces, trial.robot.joint_names)
-    return result
+    return result, traces
 
 
 def _length(trial: Trial) -> float:
@@ -122,23 +155,22 @@ def _length(trial: Trial) -> float:
     return float(trial.task.termination.episode_seconds)  # JSON has no numbers of NumPy
 
 
-def warn_of_replaced(files: Sequence[Path], trial: Trial) -> None:
-    """Warn, before any episode, of results that the evaluation will replace although they are of other demonstrations
-    or of episodes of another length."""
-    for file in files:
-        try:
-            known = read_result(file)
-        except XResetError:  # the file does not exist, or is damaged
-            continue
-        what = ""
-        if known.inputs.get("demos") != trial.inputs.get("demos"):
-            what = "other demonstrations"
-        elif known.episode_seconds not in (None, _length(trial)):
-            what = "episodes of another length"
-        if what:
-            logging.getLogger(__name__).warning(
-                "%s: results of %s, which this evaluation replaces. To keep them, stop it now and choose another "
-                "folder (out).",
-                file,
-                what,
-            )
+def _warn_of_replaced(file: Path, trial: Trial) -> None:
+    """Warn, before any episode, of results that will be replaced although they are of other demonstrations or of
+    episodes of another length."""
+    try:
+        known = read_result(file)
+    except XResetError:  # the file does not exist, or is damaged
+        return
+    what = ""
+    if known.inputs.get("demos") != trial.inputs.get("demos"):
+        what = "other demonstrations"
+    elif known.episode_seconds not in (None, _length(trial)):
+        what = "episodes of another length"
+    if what:
+        logging.getLogger(__name__).warning(
+            "%s: results of %s, which this evaluation replaces. To keep them, stop it now and choose another folder "
+            "(out).",
+            file,
+            what,
+        )

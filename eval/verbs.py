@@ -8,12 +8,11 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from xreset.errors import RunError, XResetError
-from xreset.eval.conditions import FAULTS, SWEPT, Condition, Property, chosen, nominal_task
+from xreset.eval.conditions import FAULTS, SWEPT, Condition, chosen_properties, nominal_task
 from xreset.eval.report import X
 from xreset.files.checks import (
     Mp4,
@@ -89,11 +88,10 @@ def evaluate(
     """
     from xreset.eval import experiment
     from xreset.eval.policy_spec import load_policy
-    from xreset.eval.results import Evaluation
     from xreset.eval.rollout import chosen_engines, load_trial
 
     spec = load_policy(policy, robot=robot)
-    played_engines = chosen_engines(engines, device)
+    chosen = chosen_engines(engines, device)
     trial = load_trial(
         spec,
         demos,
@@ -102,25 +100,15 @@ def evaluate(
         num_envs=num_envs,
         episode_seconds=episode_seconds,
     )
-    folder = Path(out) if out else spec.folder
-    found = Evaluation()
-    found.folder = folder
-    with claim_folder(folder):
-        experiment.warn_of_replaced(
-            [folder / f"{each.name}.json" for each in played_engines], trial
-        )
-        for each in played_engines:
-            result = experiment.play(
-                spec,
-                trial,
-                each,
-                [Condition(task=trial.task)],
-                folder,
-                episodes=episodes,
-                progress=partial(progress, each.name),
-            )
-            found.append(result)
-    return found
+    return experiment.play(
+        spec,
+        trial,
+        chosen,
+        [Condition(task=trial.task)],
+        Path(out) if out else spec.folder,
+        episodes=episodes,
+        progress=progress,
+    )
 
 
 @obeys_rules
@@ -172,11 +160,10 @@ def stress(
         PolicyError: the policy is unknown, or a baseline shall have faults.
         XResetError: a property is unknown or cannot have a value; nothing was played then.
     """
-    wanted = chosen(properties, FAULTS if faults else SWEPT)
+    wanted = chosen_properties(properties, FAULTS if faults else SWEPT)
     from xreset.demos.verbs import synthesize
     from xreset.eval import experiment
     from xreset.eval.policy_spec import load_policy
-    from xreset.eval.results import Evaluation
     from xreset.eval.rollout import chosen_engines, load_trial
 
     on_robot = faults or any(prop.is_fault for prop in wanted)
@@ -194,36 +181,20 @@ def stress(
                 f"The policy {spec.name!r} has no cameras to change. Choose other properties."
             )
     task = nominal_task(trial.task)
-    conditions: list[tuple[Property, list[Condition]]] = []
+    conditions = [Condition(task=task)]
     for prop in wanted:
-        conditions.append((prop, [prop.at(value, task) for value in prop.values]))
-    default = "faults" if on_robot else "stress"
-    folder = Path(out) if out else spec.folder.parent / default
-    found = Evaluation()
-    found.folder = folder
-    played_engines = chosen_engines(engines, device)
-    with claim_folder(folder):
-        for each in played_engines:
-            usable = [Condition(task=task)]
-            left_out = {}
-            for prop, own in conditions:
-                if experiment.can_set(each, prop):
-                    usable += own
-                else:
-                    left_out[prop.option] = f"{each.name} cannot set it"
-            result = experiment.play(
-                spec,
-                trial,
-                each,
-                usable,
-                folder,
-                episodes=episodes,
-                on_robot=on_robot,
-                left_out=left_out,
-                progress=partial(progress, each.name),
-            )
-            found.append(result)
-    return found
+        conditions += [prop.at(value, task) for value in prop.values]
+    default = spec.folder.parent / ("faults" if on_robot else "stress")
+    return experiment.play(
+        spec,
+        trial,
+        chosen_engines(engines, device),
+        conditions,
+        Path(out) if out else default,
+        episodes=episodes,
+        on_robot=on_robot,
+        progress=progress,
+    )
 
 
 @obeys_rules

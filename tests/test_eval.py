@@ -592,12 +592,12 @@ class ResultsTest(InFolder):
             with (
                 self.subTest(told),
                 patch("xreset.eval.rollout.load_trial") as load_trial,
-                patch("xreset.eval.experiment.play", side_effect=KeyboardInterrupt),
+                patch("xreset.eval.experiment.roll_out", side_effect=KeyboardInterrupt),
                 logged("xreset.eval.experiment") as logs,
                 self.assertRaises(KeyboardInterrupt),
             ):
-                load_trial.return_value.inputs = {"demos": demos}
-                load_trial.return_value.task.termination.episode_seconds = seconds
+                task = TaskConfig(termination=TerminationConfig(episode_seconds=seconds))
+                load_trial.return_value = toy_grasp.trial(task, inputs={"demos": demos})
                 evaluate(self.policy, "demos.npz", "mujoco")
             if told:
                 self.assertIn(told, logs.output[0])

@@ -12,7 +12,7 @@ from tests.data import InFolder, refuses
 from tests.toy_bank import SOUP
 from tests.toy_results import swept
 from xreset.errors import XResetError
-from xreset.eval.conditions import PROPERTIES, SWEPT, chosen, nominal_task
+from xreset.eval.conditions import PROPERTIES, SWEPT, chosen_properties, nominal_task
 from xreset.eval.effects import by_property, curves
 from xreset.eval.results import read_evaluation
 from xreset.files.storage import claim
@@ -48,11 +48,13 @@ class StressedTest(TestCase):
             self.assertEqual(found.reset, task.reset)
 
     def test_values_of_ones_own(self):
-        (prop,) = chosen(["arm-stiffness=2,0.5,1"])
+        (prop,) = chosen_properties(["arm-stiffness=2,0.5,1"])
         self.assertEqual((prop.option, prop.values), ("arm-stiffness", (0.5, 2.0)))
-        self.assertEqual(chosen(["arm_stiffness=2,0.5"]), (prop,), "as the field is written")
-        self.assertEqual(chosen("arm-stiffness=2,0.5"), (prop,), "one")
-        self.assertEqual(chosen([]), SWEPT)
+        self.assertEqual(
+            chosen_properties(["arm_stiffness=2,0.5"]), (prop,), "as the field is written"
+        )
+        self.assertEqual(chosen_properties("arm-stiffness=2,0.5"), (prop,), "one")
+        self.assertEqual(chosen_properties([]), SWEPT)
 
     def test_refusals(self):
         for text, words in (
@@ -64,16 +66,16 @@ class StressedTest(TestCase):
             ("action-latency=1", "1 is too much. Give s, at most 0.5"),
         ):
             with refuses(self, words, XResetError, text):
-                chosen([text])
-        (late,) = chosen(["action-latency"])
+                chosen_properties([text])
+        (late,) = chosen_properties(["action-latency"])
         with self.assertRaisesRegex(
             XResetError, "action-latency 5 s cannot be tried: .* fewer than the 300 of an episode"
         ):
             late.at(5.0, TaskConfig())
-        (missed,) = chosen(["missed-deadlines=0.5"])
+        (missed,) = chosen_properties(["missed-deadlines=0.5"])
         with self.assertRaisesRegex(XResetError, "missed-deadlines 1.5 of the steps cannot be"):
             missed.at(1.5, TaskConfig())
-        (light,) = chosen(["object-mass=0"])
+        (light,) = chosen_properties(["object-mass=0"])
         with self.assertRaisesRegex(
             XResetError, "object-mass x 0 cannot be tried: mass_scale .*0.0.*above 0"
         ):

@@ -164,7 +164,6 @@ def page(report: Report) -> str:
     clocks = {}
     for label, members in groups.items():
         clocks[label] = [member.lift for member in members]
-    above = report.scores[report.scores["metric"].str.contains(" minus ", regex=False)]
     return render(
         "report.html.j2",
         report=report,
@@ -174,7 +173,7 @@ def page(report: Report) -> str:
         single=len(report.trainings) == 1,
         metrics=METRICS,
         counted=COUNTED,
-        rows=tables.results(groups, report.scores, above),
+        rows=tables.results(groups, report.scores),
         versions=caption(t.first.policy for t in evaluated),
         headline=headline(evaluated),
         colors=COLORS,

@@ -49,24 +49,23 @@ class Row:
     """Whether that is a difference (:func:`xreset.eval.report.groups.certain_differences`)."""
 
 
-def results(groups: Groups, found: Table, above: Table) -> list[Row]:
+def results(groups: Groups, scores: Table) -> list[Row]:
     """Return a row for each group and engine.
 
     Args:
         groups: the groups.
-        found: :func:`xreset.eval.report.groups.scores`.
-        above: :func:`xreset.eval.report.groups.differences`.
+        scores: :func:`xreset.eval.report.groups.scores` and :func:`~xreset.eval.report.groups.differences`.
     """
     rows = []
-    progress = f"task_progress minus {next(iter(groups), None)}"
-    every = found[found["object"] == EVERY].set_index(["group", "engine", "metric"])
-    more = above[above["metric"] == progress].set_index(["group", "engine"])
+    above = f"task_progress minus {next(iter(groups), None)}"
+    every = scores[scores["object"] == EVERY].set_index(["group", "engine", "metric"])
+    figures = every[["mean", "low", "high"]]
     certain = certain_differences(groups)
     for label, members in groups.items():
         for engine, episodes in by_engine(members):
             cells = []
             for name, metric in METRICS.items():
-                mean, low, high = every.loc[(label, engine, name), ["mean", "low", "high"]]
+                mean, low, high = figures.loc[(label, engine, name)]
                 text = metric.text(mean, len(episodes))
                 within = "" if isnan(low) else metric.interval_text(low, high)
                 cells.append(
@@ -78,8 +77,8 @@ def results(groups: Groups, found: Table, above: Table) -> list[Row]:
                     )
                 )
             difference = ""
-            if (label, engine) in more.index:
-                difference = points_text(*more.loc[(label, engine), ["mean", "low", "high"]])
+            if (label, engine, above) in figures.index:
+                difference = points_text(*figures.loc[(label, engine, above)])
             row = Row(
                 label=label,
                 engine=engine,

@@ -218,7 +218,7 @@ class LeRobot(Case):
         for words, options in (
             ("is there already", {"folder": self.folder / "eval"}),
             ("must be even", {"size": (321, 240)}),
-            ("Unknown camera rear", {"cameras": ("rear",)}),
+            ("Unknown camera 'rear'", {"cameras": ("rear",)}),
             (
                 "'side' is given twice. Give each camera once",
                 {"cameras": ("side", "front", "side")},

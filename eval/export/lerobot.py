@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from xreset.cameras.config import CAMERAS, VisionConfig, check_each_once
+from xreset.cameras.config import CAMERAS, VisionConfig, camera_of, check_each_once
 from xreset.errors import XResetError, needs
 from xreset.eval.export.recorded import SCHEMA, RecordedEpisodes
 from xreset.eval.report.clips import draw_state, draw_view, policy_cameras
@@ -65,11 +65,7 @@ def write_lerobot(
     """
     with needs("pyarrow, which writes LeRobot data sets,", "lerobot"):
         import pyarrow.parquet  # noqa: F401
-    if unknown := set(cameras) - set(CAMERAS):
-        raise XResetError(
-            f"Unknown camera {', '.join(sorted(unknown))}. Choose from: {', '.join(CAMERAS)}."
-        )
-    check_each_once([CAMERAS[name] for name in cameras])
+    check_each_once([camera_of(name) for name in cameras])
     if cameras and not video:
         raise XResetError(
             "Films of cameras are wanted and not wanted. Leave out --no-video or --camera."

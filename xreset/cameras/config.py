@@ -17,6 +17,7 @@ from xreset.files.checks import (
     Share,
     frozen,
 )
+from xreset.files.text import shown
 
 Point = Annotated[
     tuple[float, float, float],
@@ -124,6 +125,15 @@ WRIST = CameraConfig(
 """A camera behind the palm that looks along the fingers."""
 CAMERAS = {"front": FRONT, "side": SIDE, "wrist": WRIST}
 """Name -> camera."""
+
+
+def camera_of(camera: str | CameraConfig) -> CameraConfig:
+    """Return a camera, or the one of a name; ``XResetError`` if it is unknown."""
+    if isinstance(camera, CameraConfig):
+        return camera
+    if camera not in CAMERAS:
+        raise XResetError(f"Unknown camera {shown(camera)}. Choose from: {', '.join(CAMERAS)}.")
+    return CAMERAS[camera]
 
 
 def check_each_once(cameras: Sequence[CameraConfig]) -> None:

@@ -18,6 +18,7 @@ from xreset.cameras.config import (
     STUDENT_VISION,
     CameraConfig,
     VisionConfig,
+    camera_of,
     check_each_once,
 )
 from xreset.env.manipulation import make_env
@@ -210,7 +211,7 @@ def config_of_student(
         XResetError: a camera is unknown.
     """
     wanted = [cameras] if isinstance(cameras, str | CameraConfig) else cameras
-    chosen = tuple(_camera(each) for each in wanted)
+    chosen = tuple(map(camera_of, wanted))
     vision = replace(STUDENT_VISION, cameras=chosen)
     return student_config(read_policy(teacher).contract.task, vision)
 
@@ -292,15 +293,6 @@ def read_teacher(name: str | Path, inputs: Inputs, config: TrainConfig) -> OnnxP
         str(teacher.path), contract, inputs.robot, replace(config.task, vision=VisionConfig())
     )
     return teacher
-
-
-def _camera(camera: str | CameraConfig) -> CameraConfig:
-    """Return a camera, or the one of a name."""
-    if isinstance(camera, CameraConfig):
-        return camera
-    if camera not in CAMERAS:
-        raise XResetError(f"Unknown camera {shown(camera)}. Choose from: {', '.join(CAMERAS)}.")
-    return CAMERAS[camera]
 
 
 @contextmanager

@@ -109,6 +109,11 @@ class UsageTest(TestCase):
                 "resets /nowhere/moves.npz --out /nowhere/bank.npz",
             ),
             (
+                r"^xreset retarget: there is no demos\.npz \(an archive of xreset demos\)",
+                "retarget demos.npz --robot openarm --out /nowhere/moves.npz",
+            ),
+            (r"^xreset demos: there is no a\.npz", "demos select a.npz b.npz"),
+            (
                 r"Unknown engine 'bulet'\. Choose from: .*pybullet",
                 "engines check --engine bulet",
             ),

@@ -242,8 +242,8 @@ def select_demos(
     """
     from xreset.demos.archive import merge_demos, read_demos, write_demos
 
-    inputs = {f"demos {i}": file_hash(file) for i, file in enumerate(files)}
     demos = merge_demos([*map(read_demos, files)])
+    inputs = {f"demos {i}": file_hash(file) for i, file in enumerate(files)}
     others = None
     if rest is None:
         kept = demos.select(**selection.conditions())

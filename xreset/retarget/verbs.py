@@ -76,8 +76,9 @@ def retarget_demos(
     spec = load_robot(robot)
     inputs = {}
     if isinstance(demos, str | Path):
-        inputs["demos"] = file_hash(demos)
-        demos = read_demos(demos)
+        path = demos
+        demos = read_demos(path)
+        inputs["demos"] = file_hash(path)
     if objects is None:
         objects = tuple(demo_objects(demos, meshes).values())
     objects = checked_objects(spec, objects)

@@ -44,7 +44,7 @@ from xreset.eval.policy_spec import load_policy
 from xreset.files.storage import claim, file_hash, write_json
 from xreset.learning import verbs
 from xreset.learning.checkpoint import load_moments, read_checkpoint
-from xreset.learning.config import ModelConfig, PpoConfig, ScheduleConfig, TrainConfig
+from xreset.learning.config import ScheduleConfig, TrainConfig
 from xreset.learning.export import exported
 from xreset.learning.exported import read_policy
 from xreset.learning.recipes import RECIPES, own_terms_flags, starting_config
@@ -56,7 +56,7 @@ from xreset.learning.run import (
 from xreset.learning.runner import TrainingRunner, _stop_on_interrupt
 from xreset.learning.train import cleanly
 from xreset.policy.onnx_policy import check_contract
-from xreset.task.config import RandomizationConfig, RewardConfig, TaskConfig
+from xreset.task.config import RandomizationConfig, RewardConfig
 
 ONE = replace(CONFIG, iterations=1)
 
@@ -428,11 +428,6 @@ class TrainingTest(WithBank):
 
         self.assertEqual(parsed(), TrainConfig())
         self.assertEqual(RECIPES["default"].config, TrainConfig())
-        parts = (TaskConfig(), ModelConfig(), PpoConfig())
-        paper = RECIPES["paper"].config
-        self.assertEqual(
-            (paper.task, paper.model, paper.ppo), parts, "their defaults are the paper's"
-        )
         minutes = parsed("--recipe", "minutes", "--config.ppo.entropy", "0.001")
         self.assertEqual(
             (minutes.ppo.desired_kl, minutes.ppo.entropy, minutes.model.initial_std),

@@ -166,7 +166,8 @@ PPO = PpoConfig(
 class TrainConfig(Checked):
     """Configuration of a training run, as saved in the run folder.
 
-    The defaults are the recipe of the headline results. Those of its parts, such as ``TaskConfig()``, are the paper's.
+    The defaults are the recipe ``default``, that of the headline results. Those of its parts, such as ``TaskConfig()``,
+    are the recipe ``paper``.
     """
 
     task: TaskConfig = TASK

@@ -1,4 +1,5 @@
-"""Named starting points for a training's configuration, ``recipes.toml``, and those of the user's own files."""
+"""Named starting points for a training's configuration: ``default`` and ``paper``, those of ``recipes.toml``, and the
+user's own files."""
 
 from __future__ import annotations
 
@@ -16,7 +17,7 @@ from xreset.errors import RunError
 from xreset.files.checks import from_dict, frozen, merged
 from xreset.files.storage import read_toml
 from xreset.files.text import plain, shown
-from xreset.learning.config import TrainConfig
+from xreset.learning.config import ModelConfig, PpoConfig, TrainConfig
 from xreset.learning.run import read_run
 from xreset.spec import RobotSpec
 from xreset.task.config import TaskConfig
@@ -31,7 +32,16 @@ class Recipe:
 
 
 def _read_recipes() -> dict[str, Recipe]:
-    recipes: dict[str, Recipe] = {}
+    paper = TrainConfig(task=TaskConfig(), model=ModelConfig(), ppo=PpoConfig(), iterations=10_000)
+    recipes = {
+        "default": Recipe(
+            config=TrainConfig(),
+            about="the recipe of the headline results, for 25 minutes on one GPU",
+        ),
+        "paper": Recipe(
+            config=paper, about="the paper's tables VIII and IX, for hours on several GPUs"
+        ),
+    }
     for name, changes in tomllib.loads(_FILE.read_text()).items():
         about = changes.pop("about")
         recipes[name] = Recipe(config=_changed(changes, recipes, f"{_FILE}: {name}"), about=about)

@@ -6,8 +6,6 @@ import inspect
 import io
 from unittest.mock import patch
 
-from rich.console import Console
-
 from xreset.cli import main
 
 
@@ -53,10 +51,3 @@ def calls_of(module, name):
 
     with patch.object(module, name, record):
         yield calls
-
-
-def printed(table):
-    """A table as a terminal of 120 columns shows it."""
-    with io.StringIO() as sink:
-        Console(width=120, file=sink).print(table)
-        return sink.getvalue()

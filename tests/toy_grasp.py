@@ -167,7 +167,3 @@ def with_scene(base, name, change):
         return base.make(change(scene), num_worlds, object_index)
 
     return replace(base, name=name, make=make)
-
-
-def with_tip_friction(scene, factor):
-    return replace(scene, friction=replace(scene.friction, tip=scene.friction.tip * factor))

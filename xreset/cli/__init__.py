@@ -1,7 +1,8 @@
 """The command line: ``xreset COMMAND ...``.
 
-The first word selects a module of this package. Only this module is imported, so that ``xreset --help`` is instant. A
-command module holds typed functions; tyro turns their signatures and docstrings into flags.
+The first word selects a module of this package. Only this module and the small ``_earlier`` are imported, so that
+``xreset --help`` is instant. A command module holds typed functions; tyro turns their signatures and docstrings into
+flags.
 
 The help of a command must be instant, too. Therefore command modules import only light modules at their top, such as
 configurations and errors; their functions import the rest.
@@ -51,9 +52,10 @@ def main(argv: list[str] | None = None) -> None:
     Args:
         argv: arguments, without the program; default: those of this process.
     """
+    from xreset.cli._earlier import with_present_words
     from xreset.errors import Stopped, XResetError
 
-    argv = _with_present_flags(sys.argv[1:] if argv is None else argv)
+    argv = with_present_words(sys.argv[1:] if argv is None else argv)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):
             # characters that the terminal lacks are written as escapes
@@ -89,92 +91,6 @@ def main(argv: list[str] | None = None) -> None:
         _fail(argv, "Out of memory. Use fewer worlds (--num-envs) or a smaller file.")
 
 
-_RENAMED = {
-    "--backend": "--engine",
-    "--objects": "--meshes",
-    "--like": "--recipe",
-    "--fault": "--property",
-}
-"""Flag of earlier versions -> its present name."""
-_MOVED = {
-    "rehearse": "stress --faults",
-    "compare": "report",
-    "distill": "train --teacher",
-    "demos info": "demos select",
-    "export lerobot": "export episodes",
-    "export npz": "export episodes",
-}
-"""Command of earlier versions -> its present words."""
-_GONE = {
-    "select": "evaluate checkpoints, xreset eval RUN/checkpoints/NUMBER.pt, and compare them with xreset report",
-    "engines attribute": "xreset engines check measures engines, xreset stress what a policy tolerates",
-    "engines trace": "xreset engines compare plays grasps in several engines, xreset report films policies in them",
-}
-"""Command of earlier versions -> what to do in place of it."""
-_RENAMED_IN = {
-    "engines compare": {"--only": "--object"},
-}
-"""Command -> flag of earlier versions -> its present name."""
-_NEEDLESS = {
-    "--resume": "a training continues with --out RUN alone, or with its whole command",
-}
-"""Flag of earlier versions -> why it is not needed."""
-_SQUEEZE = (
-    "fingers press with --squeeze.force and the object's weight, in balance; with --squeeze.force 0"
-    " no finger presses"
-)
-_GONE_FLAGS = {
-    "--settle": "episodes begin as recorded, because starts at rest gained nothing",
-    "--squeeze.weight": _SQUEEZE,
-    "--squeeze.balanced": _SQUEEZE,
-    "--squeeze.no-balanced": _SQUEEZE,
-    "--squeeze.reach": _SQUEEZE,
-}
-"""Flag of earlier versions -> what is done now."""
-_NAME_OBJECTS = (["demos", "synth"], ["demos", "select"])
-"""Commands whose ``--objects`` are names of objects, and always were."""
-
-
-def _with_present_flags(argv: list[str]) -> list[str]:
-    """Return the arguments with the present names of commands and flags, and print what was renamed."""
-    for count in (1, 2):
-        earlier = " ".join(argv[:count])
-        if earlier not in _MOVED:
-            continue
-        present = _MOVED[earlier]
-        print(
-            f"xreset: {earlier} is now {present}. The next release removes {earlier}.",
-            file=sys.stderr,
-        )
-        if earlier == "distill" and argv[1:2] and argv[1].startswith("-"):
-            present = "train"  # continues a run, and names no teacher
-        argv = [*present.split(), *argv[count:]]
-        break
-    changed = _RENAMED | _RENAMED_IN.get(" ".join(argv[:2]), {})
-    if argv[:2] in _NAME_OBJECTS:
-        del changed["--objects"]
-    words = []
-    used = {}
-    for word in argv:
-        flag, equals, value = word.partition("=")
-        if flag in changed:
-            used[flag] = changed[flag]
-        if flag.startswith("--vision."):
-            changed[flag] = f"--config.task.{flag[2:]}"
-        if flag in _GONE_FLAGS:
-            print(f"xreset: {flag} is gone: {_GONE_FLAGS[flag]}.", file=sys.stderr)
-            raise SystemExit(2)
-        if flag in _NEEDLESS:
-            print(f"xreset: {flag} is gone: {_NEEDLESS[flag]}.", file=sys.stderr)
-        else:
-            words.append(changed.get(flag, flag) + equals + value)
-    for earlier, flag in used.items():
-        print(
-            f"xreset: {earlier} is now {flag}. The next release removes {earlier}.", file=sys.stderr
-        )
-    return words
-
-
 def _extra_with(package: str) -> str | None:
     """Return an extra of xreset that brings a package; None: no extra does."""
     from importlib import metadata
@@ -200,10 +116,6 @@ def perform(argv: list[str]) -> None:
         return
     name = argv[0]
     arguments = argv[1:]
-    for gone in (name, " ".join(argv[:2])):
-        if gone in _GONE:
-            print(f"xreset: {gone} is gone: {_GONE[gone]}.", file=sys.stderr)
-            raise SystemExit(2)
     if name not in COMMANDS:
         print(f"xreset: Unknown command {name!r}.\n\n{_usage()}", file=sys.stderr)
         raise SystemExit(2)

@@ -9,8 +9,9 @@ from pathlib import Path
 
 from xreset.eval.report import fairness
 from xreset.eval.report.make import PageTable, Report, collect, write_report
-from xreset.eval.report.read import Training, read_training
+from xreset.eval.report.read import Training, read_training, versions
 from xreset.eval.results import has_results
+from xreset.eval.study.file import TableSpec
 from xreset.eval.study.paper import TRAINING
 from xreset.eval.study.plan import Plan
 from xreset.eval.study.tables import FilledTable, fill
@@ -30,11 +31,12 @@ def write_page(plan: Plan, out: Path) -> Report:
         if not table.engines:
             notes.append(f"{table.title}: nothing is evaluated yet.")
             continue
-        notes += [f"{table.title}: {note}" for note in _unfair(plan, table)]
-        for engine in table.engines:
-            title = f"{table.title}: {engine} {table.versions(engine)}"
-            shown = PageTable(title=title, rows=table.engines[engine], note=_note(table, engine))
-            page_tables.append(shown)
+        notes += [f"{table.title}: {note}" for note in _unfair(plan, spec, table)]
+        for engine, rows in table.engines.items():
+            played = versions(chain(*table.trainings.values()), engine)
+            note = f"{_note(spec, rows[0][0])} {table.counts(engine)}"
+            title = f"{table.title}: {engine} {played}"
+            page_tables.append(PageTable(title=title, rows=rows, note=note))
     report = collect(
         list(_trainings(plan)),
         title=f"Study {plan.name}: {plan.study.about}",
@@ -44,16 +46,15 @@ def write_page(plan: Plan, out: Path) -> Report:
     return write_report(report, out)
 
 
-def _note(table: FilledTable, engine: str) -> str:
-    """Return what the figures of a table are, and of how many episodes."""
+def _note(spec: TableSpec, unit: str) -> str:
+    """Return what the figures of a table are."""
     text = (
-        f"{'Centimetres' if table.unit == 'cm' else 'Percent'}, mean and in brackets the 95 % interval: a bootstrap "
+        f"{'Centimetres' if unit == 'cm' else 'Percent'}, mean and in brackets the 95 % interval: a bootstrap "
         "over demonstrations and, where there are several, over seeds, too; over two or three seeds it is too narrow."
     )
-    if table.paper:
+    if spec.paper:
         text += " The paper's figures follow, with their standard error where it states one."
-    text += " All of them: the mean over all episodes, left out while an object is missing."
-    return f"{text} {table.counts(engine)}"
+    return f"{text} All of them: the mean over all episodes, left out while an object is missing."
 
 
 def _trainings(plan: Plan) -> Iterator[Training]:
@@ -82,7 +83,7 @@ def _incomplete(plan: Plan) -> Iterator[str]:
         yield f"Not evaluated in {engine} on this machine: {reason.splitlines()[0]}"
 
 
-def _unfair(plan: Plan, table: FilledTable) -> Iterator[str]:
+def _unfair(plan: Plan, spec: TableSpec, table: FilledTable) -> Iterator[str]:
     """Yield why a table's figures are not comparable, with one another or with the paper's."""
     by_objects = defaultdict(list)
     for training in chain(*table.trainings.values()):
@@ -109,5 +110,5 @@ def _unfair(plan: Plan, table: FilledTable) -> Iterator[str]:
     if lengths and max(lengths.values()) > (1 + _ALIKE) * min(lengths.values()):
         listing = ", ".join(f"{name} {steps:.3g}" for name, steps in lengths.items())
         yield f"not of equal length (million environment steps: {listing})."
-    if table.paper:
+    if spec.paper:
         yield f"the paper's policies took {TRAINING}; ours as in the table of what differs."

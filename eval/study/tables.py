@@ -9,7 +9,7 @@ import pandas as pd
 
 from xreset.eval.metrics import METRICS
 from xreset.eval.report.groups import COUNTED, counted, estimate
-from xreset.eval.report.read import Training, read_training, versions
+from xreset.eval.report.read import Training, read_training
 from xreset.eval.results import has_results
 from xreset.eval.stats import Table
 from xreset.eval.study.file import TableSpec
@@ -26,16 +26,12 @@ class FilledTable:
     """A table of the study with its figures."""
 
     title: str
-    unit: str
-    """Unit of the figures, where their column does not state one."""
     engines: dict[str, Rows]
-    """Engine -> rows of text; ``-`` where a run was not evaluated."""
+    """Engine -> rows of text; ``-`` where a run was not evaluated. The first cell is the unit of the figures."""
     trainings: dict[str, list[Training]]
     """Run of the study -> its evaluated trainings."""
     episodes: dict[str, Table]
     """Run of the study -> all episodes. Trainings of one seed have the same name, also if each trained one object."""
-    paper: bool
-    """Whether the table has figures of the paper."""
 
     def counts(self, engine: str) -> str:
         """Return the numbers of episodes, demonstrations and seeds of each run in an engine, as text."""
@@ -45,10 +41,6 @@ class FilledTable:
             if len(own):
                 texts.append(f"{name} {counted(own)}")
         return f"{COUNTED.capitalize()}: {', '.join(texts)}."
-
-    def versions(self, engine: str) -> str:
-        """Return the engine's versions in which the runs were evaluated."""
-        return versions(chain(*self.trainings.values()), engine)
 
 
 def fill(plan: Plan, table: TableSpec) -> FilledTable:
@@ -91,11 +83,9 @@ def fill(plan: Plan, table: TableSpec) -> FilledTable:
             engines[engine] = lines
     return FilledTable(
         title=table.title or layout.title,
-        unit=unit,
         engines=engines,
         trainings=trainings,
         episodes=episodes,
-        paper=table.paper is not None,
     )
 
 

@@ -3,7 +3,6 @@
 A reader may read several files, of which one is damaged and contradicts the others. :mod:`tests.damage` has the ways to damage a file.
 """
 
-import json
 import logging
 import tempfile
 import time
@@ -43,12 +42,9 @@ from xreset import (
     write_goals,
     write_retargeted,
 )
-from xreset.backends.conformance import SCHEMA as CONFORMANCE
 from xreset.demos.dexycb import _read_extrinsics, _read_meta, _read_npz
 from xreset.demos.keypoints import read_keypoints, read_transform
 from xreset.eval.effects import curves, verdict
-from xreset.eval.engines.page import page
-from xreset.eval.engines.page import read as read_page
 from xreset.eval.report.read import read_curves, run_facts
 from xreset.eval.results import read_result, read_traces, write_result
 from xreset.eval.study.file import SHIPPED, read_study
@@ -109,7 +105,7 @@ def readers():
             add_evaluation,
             add_run,
             add_curves,
-            add_texts_of_engines,
+            add_studies,
             add_networks,
             add_deployed,
             add_robots,
@@ -223,14 +219,9 @@ def add_curves(every):
     )
 
 
-def add_texts_of_engines(every):
+def add_studies(every):
     path = every.add("study", "study.toml", read_study, "text", ("config",))
     path.write_bytes((SHIPPED / "first_grasp.toml").read_bytes())
-    stored = json.loads((Path(__file__).with_name("engines") / "conformance.json").read_text())
-    assert stored["schema"] == CONFORMANCE
-    stored["runs"] = [run | {"checks": run["checks"][:4]} for run in stored["runs"][:2]]
-    path = every.add("conformance", "conformance.json", lambda p: page(read_page([p])), "json")
-    write_json(path, stored)
 
 
 def add_networks(every):

@@ -66,7 +66,7 @@ def check_engines(
     if json is not None:
         write_json(json, found)
     if page is not None:
-        write_whole(page, pages.page([found]))
+        write_whole(page, pages.page(found))
     return runs
 
 

@@ -1,6 +1,7 @@
 """The documentation names commands, options, functions and files that exist, and fits on the page."""
 
 import ast
+import builtins
 import importlib
 import inspect
 import re
@@ -107,6 +108,27 @@ def unknown_names(program):
     return unknown
 
 
+GIVEN = {"live.md": {"goal_pos", "goal_quat", "objects", "task"}}
+"""Names that the text of a page gives to its programs."""
+
+
+def undefined_names(texts):
+    """Return the names that the programs of a page use, and none of them defines."""
+    used = set()
+    defined = set(dir(builtins))
+    for text in texts:
+        for node in ast.walk(ast.parse(text)):
+            if isinstance(node, ast.Name):
+                (used if isinstance(node.ctx, ast.Load) else defined).add(node.id)
+            elif isinstance(node, ast.FunctionDef | ast.ClassDef):
+                defined.add(node.name)
+            elif isinstance(node, ast.arg):
+                defined.add(node.arg)
+            elif isinstance(node, ast.alias):
+                defined.add((node.asname or node.name).partition(".")[0])
+    return used - defined
+
+
 class DocumentedTest(TestCase):
     def test_every_command_and_option_exists(self):
         seen = 0
@@ -136,6 +158,9 @@ class DocumentedTest(TestCase):
                 seen += 1
                 with self.subTest(page=page.name, program=program[:60]):
                     self.assertEqual(unknown_names(program), [])
+            with self.subTest(page=page.name):
+                undefined = undefined_names(programs(page))
+                self.assertEqual(undefined, GIVEN.get(page.name, set()))
         self.assertGreater(seen, 6)
 
 

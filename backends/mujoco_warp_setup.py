@@ -54,7 +54,8 @@ def engine_step(device: Any) -> Callable[[Any, Any], None]:
             stacklevel=3,
         )
         return mjw.step
-    return partial(step.forked_step, wp.Stream(device) if device.is_cuda else None)
+    streams = [wp.Stream(device), wp.Stream(device)] if device.is_cuda else []
+    return partial(step.forked_step, streams)
 
 
 def _replacement(name: str) -> ModuleType | None:

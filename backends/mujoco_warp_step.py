@@ -1,18 +1,22 @@
-"""A physics step of MuJoCo-Warp that computes free motion next to collisions and constraints.
+"""A physics step of MuJoCo-Warp that computes free motion next to collisions, and two kinds of collisions side by side.
 
-Neither reads what the other writes, and neither fills a GPU: most of their kernels are short. A test compares with the
-engine's step, in either order. This module reads the engine's private modules.
+Neither reads what the other writes, and neither fills a GPU: most of their kernels are short, and those of convex
+collisions wait for their slowest thread. A test compares with the engine's step, in either order. This module reads the
+engine's private modules.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from functools import partial
 from typing import Any
 from unittest.mock import patch
 
 import mujoco_warp as mjw
 import warp as wp
-from mujoco_warp._src import forward, solver
+from mujoco_warp._src import collision_convex, collision_core, collision_driver, forward, solver
 from mujoco_warp._src.smooth import tendon_armature
+from mujoco_warp._src.types import GeomType
 
 from xreset.backends import mujoco_warp_kernels as kernels
 
@@ -21,9 +25,13 @@ ORIGINAL = (
     forward._forward,
     forward.fwd_position,
     solver._jtdaj_groups_per_world,
+    collision_driver._narrowphase,
+    collision_convex.convex_narrowphase,
+    collision_convex.ccd_kernel_builder,
+    collision_core.write_contact.func,
 )
-"""The engine's functions that :func:`forked_step` replaces or changes."""
-KNOWN_SOURCE = "22908e55c0a3eb6f"
+"""The engine's functions that :func:`forked_step` replaces or changes, or whose counters :func:`narrowphase` trusts."""
+KNOWN_SOURCE = "053744cee268e990"
 """Digest of their source."""
 HESSIAN_WAVES = 18
 """Blocks that add contacts to the solver's matrix, in multiples of those that a GPU runs at a time; the engine has 6.
@@ -31,6 +39,9 @@ HESSIAN_WAVES = 18
 Every world gets as many blocks, and a step waits for the world with the most contacts, which has ten times the mean.
 With 18 a step takes 3.2 % less (docs/lab-book.md, "Speed").
 """
+OWN_STREAM = (GeomType.CAPSULE, GeomType.MESH)
+"""The kind of convex collisions that is found next to all others: links of the robot with the object."""
+_find_contacts = collision_driver._narrowphase
 
 
 def smooth_dynamics(m: Any, d: Any) -> None:
@@ -43,11 +54,38 @@ def smooth_dynamics(m: Any, d: Any) -> None:
     mjw.fwd_acceleration(m, d, factorize=True)
 
 
-def constraints(m: Any, d: Any) -> None:
+def contacts(m: Any, d: Any, aside: wp.Stream | None = None) -> None:
+    """Find contacts, those of :data:`OWN_STREAM` on a stream of their own if there is one."""
+    if aside is None:
+        mjw.collision(m, d)
+    else:
+        with patch.object(collision_driver, "_narrowphase", partial(narrowphase, aside)):
+            mjw.collision(m, d)
+
+
+def constraints(m: Any, d: Any, aside: wp.Stream | None = None) -> None:
     """Find contacts and rows of constraints."""
-    mjw.collision(m, d)
+    contacts(m, d, aside)
     mjw.make_constraint(m, d)
     keep_contacts(d)
+
+
+def narrowphase(aside: wp.Stream, m: Any, d: Any, ctx: Any) -> None:
+    """Find contacts of the pairs that are near, those of :data:`OWN_STREAM` on a stream of their own.
+
+    The engine lets the kinds of convex pairs follow one another, because they share scratch memory: each counts its
+    rows from 0. Here the engine's function is called twice, and each call allocates its own, 0.5 MB a world with nine
+    objects. Contacts of both get their places from one atomic counter, as the contacts of one kind do.
+    """
+    main = wp.get_stream()
+    aside.wait_stream(main)
+    with wp.ScopedStream(aside, sync_enter=False):
+        collision_driver.convex_narrowphase(m, d, ctx, [OWN_STREAM])
+    kinds = collision_driver.MJ_COLLISION_TABLE
+    with patch.dict(kinds):
+        del kinds[OWN_STREAM]
+        _find_contacts(m, d, ctx)
+    main.wait_stream(aside)
 
 
 def keep_contacts(d: Any) -> None:
@@ -72,24 +110,25 @@ def more_blocks() -> Any:
     return patch.object(solver, "_JTDAJ_OVERSUBSCRIBE_WAVES", HESSIAN_WAVES)
 
 
-def forked_step(second: wp.Stream | None, m: Any, d: Any) -> None:
-    """Queue ``mujoco_warp.step`` after its kinematics, which must be there, on Warp's current stream and a second one.
+def forked_step(streams: Sequence[wp.Stream], m: Any, d: Any) -> None:
+    """Queue ``mujoco_warp.step`` after its kinematics, which must be there, on Warp's current stream and two others.
 
     Args:
-        second: None: there are no streams, as on the CPU.
+        streams: the two; none on the CPU.
         m: the engine's model.
         d: the engine's data.
     """
-    if second is None:
+    if not streams:
         smooth_dynamics(m, d)
         constraints(m, d)
         finish(m, d)
     else:
+        free_motion, aside = streams
         main = wp.get_stream()
-        second.wait_stream(main)
-        with wp.ScopedStream(second, sync_enter=False):
+        free_motion.wait_stream(main)
+        with wp.ScopedStream(free_motion, sync_enter=False):
             smooth_dynamics(m, d)
-        constraints(m, d)
-        main.wait_stream(second)
+        constraints(m, d, aside)
+        main.wait_stream(free_motion)
         with more_blocks():
             finish(m, d)

@@ -1,9 +1,9 @@
 """kernels: where the time of a physics step of mujoco-warp goes, in the worlds of a training. Needs --resets.
 
 The worlds begin in states of the bank, and random actions move the robots for a second. Then each stage is a graph of its own: free motion,
-which a step computes next to the collisions, has its own share here. The kernels, on a GPU only, run one after the other without a graph, so
-some microseconds of each are its launch. Counts are those of the last step, the mean and in brackets the largest of all worlds; the room is
-what the engine has for them.
+which a step computes next to the collisions, has its own share here; collisions are on two streams, as in a step. The kernels, on a GPU
+only, run one after the other without a graph, so some microseconds of each are its launch. Counts are those of the last step, the mean and
+in brackets the largest of all worlds; the room is what the engine has for them.
 """
 
 from __future__ import annotations
@@ -70,8 +70,13 @@ def run(options: Options, console: Console) -> None:
         _print_counts(backend, console)
 
 
-def _stages(backend: Any) -> Stages:
-    """Return the stages of a step, in an order in which they can run one after the other."""
+def _stages(backend: Any, aside: wp.Stream | None = None) -> Stages:
+    """Return the stages of a step, in an order in which they can run one after the other.
+
+    Args:
+        backend: the worlds.
+        aside: stream for one kind of the collisions.
+    """
     m = backend._model
     d = backend._data
 
@@ -86,7 +91,7 @@ def _stages(backend: Any) -> Stages:
     return {
         "kinematics": partial(mjw.fwd_kinematics, m, d),
         "free motion": partial(mujoco_warp_step.smooth_dynamics, m, d),
-        "collisions": partial(mjw.collision, m, d),
+        "collisions": partial(mujoco_warp_step.contacts, m, d, aside),
         "rows of constraints": make_rows,
         "solver": solve,
         "integration": partial(mjw.implicit, m, d),
@@ -95,7 +100,8 @@ def _stages(backend: Any) -> Stages:
 
 def _print_stages(backend: Any, console: Console) -> None:
     launches = {}
-    for name, stage in _stages(backend).items():
+    aside = wp.Stream() if backend._warp_device.is_cuda else None
+    for name, stage in _stages(backend, aside).items():
         with wp.ScopedCapture(device=backend._warp_device) as capture:
             stage()
         graph: Any = capture.graph

@@ -2,7 +2,7 @@
 
 import gc
 import weakref
-from contextlib import nullcontext
+from contextlib import ExitStack, nullcontext
 from dataclasses import replace
 from functools import partial
 from itertools import product
@@ -14,7 +14,8 @@ import mujoco_warp
 import numpy as np
 import torch
 import warp as wp
-from mujoco_warp._src import constraint, solver
+from mujoco_warp._src import collision_driver, constraint, solver
+from mujoco_warp._src.types import CollisionType, GeomType
 from numpy.testing import assert_allclose, assert_array_equal
 from torch import tensor
 from torch.testing import assert_close
@@ -22,6 +23,7 @@ from torch.testing import assert_close
 from tests.data import InFolder, refuses
 from tests.engine_checks import EngineChecks
 from xreset.backends import mujoco_warp as mujoco_warp_backend
+from xreset.backends import mujoco_warp_step
 from xreset.backends.conformance.grasp_checks import grasp
 from xreset.backends.conformance.harness import Bench
 from xreset.backends.conformance.scene import gripper, objects, scene, shape, solid
@@ -56,6 +58,14 @@ def colliding_geoms(model):
 def worlds(backend):
     """The worlds of a backend without worker processes."""
     return backend._team._worlds
+
+
+def streams_of_a_gpu(main=None):
+    """Let code that takes streams run on the CPU, which has none: one kernel after the other."""
+    stack = ExitStack()
+    stack.enter_context(patch.object(wp, "get_stream", return_value=main or Mock()))
+    stack.enter_context(patch.object(wp, "ScopedStream", lambda *_, **__: nullcontext()))
+    return stack
 
 
 def everything(backend):
@@ -255,13 +265,17 @@ class BothBackends(TestCase):
 
 
 class Steps(TestCase):
-    def test_the_forked_step_is_the_engine_s_in_either_order(self):
-        """The two streams may end in either order."""
+    def test_the_forked_step_is_the_engine_s_in_any_order(self):
+        """The streams may end in any order."""
 
         def reversed_step(m, d):
             constraints(m, d)
             smooth_dynamics(m, d)
             finish(m, d)
+
+        def step_on_streams(m, d):
+            with streams_of_a_gpu():
+                forked_step((Mock(), Mock()), m, d)
 
         def make_constraint(m, d):
             mujoco_warp.make_constraint(m, d)
@@ -271,10 +285,13 @@ class Steps(TestCase):
             with patch.object(constraint, "make_constraint", make_constraint):
                 mujoco_warp.step(m, d)
 
+        # The kind that the scene has: boxes of the gripper and the table, hulls of the bracket.
+        own_stream = (GeomType.BOX, GeomType.MESH)
         results = []
-        for step in (engine_step, partial(forked_step, None), reversed_step):
+        for step in (engine_step, partial(forked_step, ()), reversed_step, step_on_streams):
             with (
                 patch.object(mujoco_warp_backend, "engine_step", return_value=step),
+                patch.object(mujoco_warp_step, "OWN_STREAM", own_stream),
                 MujocoWarpBackend(scene(), 8) as backend,
             ):
                 state = backend.state().clone()
@@ -309,27 +326,55 @@ class Steps(TestCase):
             assert_close(a, b, rtol=0, atol=0)
 
     def test_a_gpu_adds_contacts_in_more_blocks(self):
-        """Streams of a GPU are replaced here: the CPU has none."""
-        main = Mock()
-        second = Mock()
         waves = []
 
         def solve(m, d):
-            second.wait_stream.assert_called_once_with(main)
-            main.wait_stream.assert_called_once_with(second)
             waves.append(solver._JTDAJ_OVERSUBSCRIBE_WAVES)
 
         engine = solver._JTDAJ_OVERSUBSCRIBE_WAVES
         with (
             MujocoWarpBackend(scene(), 1) as backend,
-            patch.object(wp, "get_stream", return_value=main),
-            patch.object(wp, "ScopedStream", lambda *_, **__: nullcontext()),
+            streams_of_a_gpu(),
             patch.object(mujoco_warp, "solve", solve),
         ):
-            for stream in (second, None):
-                forked_step(stream, backend._model, backend._data)
+            for streams in ((Mock(), Mock()), ()):
+                forked_step(streams, backend._model, backend._data)
         self.assertEqual(waves, [HESSIAN_WAVES, engine])
         self.assertGreater(HESSIAN_WAVES, engine)
+
+    def test_a_gpu_waits_for_contacts_and_free_motion_before_it_needs_them(self):
+        calls = Mock()
+        with (
+            MujocoWarpBackend(scene(), 1) as backend,
+            streams_of_a_gpu(calls.main),
+            patch.object(collision_driver, "nxn_broadphase", calls.broadphase),
+            patch.object(collision_driver, "convex_narrowphase", calls.convex),
+            patch.object(mujoco_warp, "make_constraint", calls.make_constraint),
+            patch.object(mujoco_warp, "solve", calls.solve),
+        ):
+            table = dict(collision_driver.MJ_COLLISION_TABLE)
+            forked_step((calls.free_motion, calls.aside), backend._model, backend._data)
+        self.assertEqual(collision_driver.MJ_COLLISION_TABLE, table)
+        self.assertEqual(
+            [name for name, _, _ in calls.mock_calls],
+            [
+                "free_motion.wait_stream",
+                "broadphase",
+                "aside.wait_stream",
+                "convex",
+                "convex",
+                "main.wait_stream",
+                "make_constraint",
+                "main.wait_stream",
+                "solve",
+            ],
+        )
+        awaited = [arguments for _, arguments, _ in calls.main.wait_stream.mock_calls]
+        self.assertEqual(awaited, [(calls.aside,), (calls.free_motion,)])
+        kinds = [arguments[3] for _, arguments, _ in calls.convex.mock_calls]
+        self.assertEqual(kinds[0], [mujoco_warp_step.OWN_STREAM])
+        convex = [kind for kind, way in table.items() if way == CollisionType.CONVEX]
+        self.assertCountEqual([*kinds[0], *kinds[1]], convex)
 
 
 class Kernels(TestCase):

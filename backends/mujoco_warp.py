@@ -41,6 +41,7 @@ from xreset.backends.mujoco_warp_setup import (
     differing_fields,
     engine_step,
     fill_batched,
+    order_pairs,
 )
 from xreset.physics.torch_warp import TorchStream, quiet
 
@@ -150,6 +151,7 @@ class MujocoWarpBackend(BatchBackend):
                     at.model, nworld=num_worlds, nconmax=contacts, nccdmax=convex, njmax=rows
                 )
                 fill_batched(self._model, scenes, self.object_index, differing)
+                order_pairs(self._model)
                 self._allocate()
                 with announced(self._warp_device):
                     self._prepare()

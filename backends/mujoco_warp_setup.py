@@ -58,6 +58,13 @@ def engine_step(device: Any) -> Callable[[Any, Any], None]:
     return partial(step.forked_step, streams)
 
 
+def order_pairs(model: Any) -> None:
+    """Order the pairs of geoms that are tested for collisions, so that tests take less time."""
+    step = _replacement("mujoco_warp_step")
+    if step is not None:
+        step.order_pairs(model)
+
+
 def _replacement(name: str) -> ModuleType | None:
     """Return a module that replaces parts of the engine; None if the engine's source is not what the module knows."""
     try:

@@ -26,12 +26,17 @@ from xreset.backends import mujoco_warp as mujoco_warp_backend
 from xreset.backends import mujoco_warp_step
 from xreset.backends.conformance.grasp_checks import grasp
 from xreset.backends.conformance.harness import Bench
-from xreset.backends.conformance.scene import gripper, objects, scene, shape, solid
+from xreset.backends.conformance.scene import flat_objects, gripper, objects, scene, shape, solid
 from xreset.backends.mjcf import compile_scene
 from xreset.backends.mjcf_model import SceneModel
 from xreset.backends.mujoco import MujocoBackend, MujocoWorld
 from xreset.backends.mujoco_warp import MujocoWarpBackend
-from xreset.backends.mujoco_warp_setup import compile_kernels, contact_room, differing_fields
+from xreset.backends.mujoco_warp_setup import (
+    compile_kernels,
+    contact_room,
+    differing_fields,
+    order_pairs,
+)
 from xreset.backends.mujoco_warp_step import (
     HESSIAN_WAVES,
     constraints,
@@ -375,6 +380,28 @@ class Steps(TestCase):
         self.assertEqual(kinds[0], [mujoco_warp_step.OWN_STREAM])
         convex = [kind for kind, way in table.items() if way == CollisionType.CONVEX]
         self.assertCountEqual([*kinds[0], *kinds[1]], convex)
+
+    def test_pairs_of_geoms_that_few_worlds_have_are_tested_last(self):
+        several = replace(scene(), objects=flat_objects())  # one and two hulls, and none
+        results = []
+        pairs = []
+        for order in (order_pairs, lambda model: None):
+            with (
+                patch.object(mujoco_warp_backend, "order_pairs", order),
+                MujocoWarpBackend(several, 4) as backend,
+            ):
+                backend.step(40)
+                results.append(everything(backend))
+                pairs.append(backend._model.nxn_geom_pair_filtered.numpy())
+                is_absent = backend._model.geom_dataid.numpy() < 0
+                is_absent &= backend._model.geom_type.numpy() == GeomType.MESH
+        for a, b in zip(*results, strict=True):
+            assert_close(a, b, rtol=0, atol=1e-5)
+        absent = [is_absent.sum(axis=0)[each].max(axis=1).tolist() for each in pairs]
+        self.assertEqual(absent[0], sorted(absent[1]))
+        self.assertNotEqual(absent[0], absent[1])
+        self.assertEqual(set(absent[0]), {0, 2, 3})
+        self.assertCountEqual(*(each.tolist() for each in pairs))
 
 
 class Kernels(TestCase):

@@ -469,6 +469,5 @@ def _wrist(points: np.ndarray, side: str) -> Rotation:
     template -= template.mean(axis=0)
     turns = []
     for found in points[:, _KNUCKLES]:
-        turn, _ = Rotation.align_vectors(found - found.mean(axis=0), template)
-        turns.append(turn)
+        turns.append(Rotation.align_vectors(found - found.mean(axis=0), template)[0])
     return Rotation.concatenate(turns)

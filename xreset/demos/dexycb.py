@@ -31,7 +31,6 @@ from xreset.geometry.shapes import transformed
 from xreset.objects.ycb import NAME_OF_ID
 
 FPS = 30.0
-_MAX_YAML_BYTES = 1 << 20
 _POSE = (-1e3, 1e3)
 """Range of the numbers of a pose: metres, quaternions and MANO's angles are smaller by far."""
 _Poses = Mapping[str, np.ndarray]
@@ -175,8 +174,6 @@ def _read_yaml(path: Path) -> dict[str, Any]:
             " subjects' folders."
         )
     try:
-        if path.stat().st_size > _MAX_YAML_BYTES:
-            raise ValueError("it has more than a megabyte")
         data = yaml.load(path.read_text(), Loader=yaml.BaseLoader)
         if not isinstance(data, dict):
             raise ValueError(f"it holds a {type(data).__name__}, expected names and values")

@@ -27,7 +27,6 @@ from xreset.demos.hand import ORDERS, Order
 from xreset.errors import DemoError
 from xreset.files.checks import frozen, is_rigid
 from xreset.files.records import RATE, UNIT_TOLERANCE, Arrays, Field, read_npz
-from xreset.files.storage import max_bytes
 from xreset.files.text import is_plain, shown
 from xreset.geometry.shapes import transformed
 from xreset.objects.catalogue import official_name
@@ -47,8 +46,6 @@ _GAP_MOTION = 0.02
 """An object that moves farther in such a time moves [m]."""
 _USUAL_RATES = (24 / 1.001, 30 / 1.001, 60 / 1.001, 120 / 1.001)
 """Rates of video that are no whole numbers [1/s]."""
-_MATRIX_BYTES = 1 << 16
-"""Largest file of a matrix of 4 x 4 numbers."""
 
 _TEXTS = ("sequence", "object", "side", "subject")
 _FILE = {
@@ -159,8 +156,6 @@ def read_transform(path: str | Path) -> np.ndarray:
     """
     path = Path(path)
     try:
-        if path.stat().st_size > _MATRIX_BYTES:
-            raise ValueError(f"it has {path.stat().st_size} bytes")
         T = np.loadtxt(path, ndmin=2)
     except Exception as error:  # numpy's parsers raise any kind of error
         raise DemoError(
@@ -225,10 +220,6 @@ def _read_csv(path: Path, name: str) -> Iterator[Arrays]:
 
 def _table(path: Path) -> dict[str, list[str]]:
     """Return the cells below each column's name. Lines that begin with # are comments."""
-    if path.stat().st_size > max_bytes():
-        raise ValueError(
-            f"it has {path.stat().st_size >> 20} MB, more than XRESET_MAX_FILE_MB allows"
-        )
     with open(path, newline="", encoding="utf-8-sig") as file:
         lines = csv.reader(file, strict=True)
         rows = [(lines.line_num, row) for row in lines if row and not row[0].startswith("#")]

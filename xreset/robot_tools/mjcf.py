@@ -140,7 +140,9 @@ def _compiled(path: Path, unit: str = "") -> mujoco.MjModel:
         ]
         done = subprocess.run(command, cwd=folder, capture_output=True, text=True, errors="replace")
         if done.returncode == 1 and "alloc" not in done.stdout:
-            _refuse_pointers([path.parent / name for name in re.findall("'([^']+)'", done.stdout)])
+            for name in re.findall("'([^']+)'", done.stdout):
+                if (path.parent / name).is_file():
+                    refuse_pointer(path.parent / name, RobotError)
             raise RobotError(
                 f"{path} is not valid MJCF: {done.stdout.strip()}. If it is a part of another file, such as a scene "
                 "that includes it, give that file."
@@ -151,15 +153,6 @@ def _compiled(path: Path, unit: str = "") -> mujoco.MjModel:
                 f"what a robot does not need, such as textures, height fields and sensors. {RAISE_LIMIT}"
             )
         return mujoco.MjModel.from_binary_path(binary)
-
-
-def _refuse_pointers(files: list[Path]) -> None:
-    try:
-        for file in files:
-            if file.is_file():
-                refuse_pointer(file)
-    except ObjectError as error:
-        raise RobotError(str(error)) from error
 
 
 def _check_numbers(path: Path, model: mujoco.MjModel) -> None:
@@ -228,7 +221,7 @@ def _pulls(model: mujoco.MjModel, problems: list[str], notes: list[str]) -> dict
 
 
 def _left_out(model: mujoco.MjModel, notes: list[str]) -> None:
-    """Note everything of a model that a robot of xreset does not have."""
+    """Note what moves or pulls in a model and is not in a robot of xreset."""
     names = [joint_name(model, joint) for joint in range(model.njnt)]
     is_free = model.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE)
     damped = np.flatnonzero((model.dof_damping > 0) | (model.dof_frictionloss > 0))
@@ -242,15 +235,6 @@ def _left_out(model: mujoco.MjModel, notes: list[str]) -> None:
     ):
         if left:
             notes.append(f"left out: {what}: {listed(left)}")
-    counts = {
-        "cameras": model.ncam,
-        "lights": model.nlight,
-        "sensors": model.nsensor,
-        "keyframes": model.nkey,
-    }
-    parts = [f"{count} {what}" for what, count in counts.items() if count]
-    if parts:
-        notes.append(f"left out: {', '.join(parts)}")
 
 
 def _solid(model: mujoco.MjModel, notes: list[str]) -> np.ndarray:

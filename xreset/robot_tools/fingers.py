@@ -221,6 +221,8 @@ class Hand:
     def _one_hand(self, thumb: str | None) -> RobotTree:
         """Return the tree, without the other hands if it has several."""
         hands = self._hands()
+        if len(hands) < 2:
+            return self.tree
         tips = []
         drives = []
         begins = []
@@ -231,20 +233,18 @@ class Hand:
             arm = set.intersection(*(set(finger.joints) for finger in own))
             arms.append(len(arm))
             begins.append([self._at[finger.links[len(arm)]][:3, 3] for finger in own])
-        gaps = [cdist(a, b).min() for a, b in combinations(begins, 2)]
+        gap = min(cdist(a, b).min() for a, b in combinations(begins, 2))
         thumbs = [one for one in self._chains() if one.name == "thumb"]
-        is_near = not gaps or (min(gaps) < _HANDS_APART and len(thumbs) < 2)
-        is_one = is_near and (not gaps or min(arms) < _ARM_JOINTS)
+        is_one = gap < _HANDS_APART and len(thumbs) < 2 and min(arms) < _ARM_JOINTS
         if is_one or any(a & b for a, b in combinations(drives, 2)):
             return self.tree
-        tree = self.tree
         for child, own in hands.items():
             if any(thumb in one.names for one in own):
                 others = [root for root in hands if root != child]
                 self._notes.append(
                     f"left out, because {thumb} is of another hand: {', '.join(others)}"
                 )
-                return without(tree, others)
+                return without(self.tree, others)
         raise RobotError(
             f"the file has {len(hands)} hands, with the fingers {'; '.join(tips)}. Choose one with --thumb, the name "
             "of a link of its thumb."
@@ -290,7 +290,7 @@ class Hand:
                     f"the hand has {len(others)} fingers and a thumb; xreset knows {', '.join(_FINGERS)}."
                 )
             toward_index, why = _index_side(first, others)
-            bases = np.array([chain.points[0] for chain in others])
+            bases, _ = _bases_and_ends(others)
             order = np.argsort(-(bases @ toward_index), kind="stable")
             others = [
                 replace(others[i], name=name) for i, name in zip(order, _FINGERS, strict=False)
@@ -392,8 +392,7 @@ class Hand:
         """Return the palm's frame [4, 4] in the hand root's, and note how far each joint is bent at home."""
         is_jaw = len(fingers) == 2 and self._is_jaw(fingers)
         along = fingers if is_jaw else fingers[1:]
-        bases = np.array([finger.points[0] for finger in along])
-        ends = np.array([finger.points[-1] for finger in along])
+        bases, ends = _bases_and_ends(along)
         x = ((ends - bases) / np.linalg.norm(ends - bases, axis=1, keepdims=True)).mean(axis=0)
         x /= np.linalg.norm(x)
         moved = np.zeros(3)
@@ -543,11 +542,16 @@ class Hand:
         return origin + axis * ((bounding_ball(cloud)[0] - origin) @ axis)
 
 
+def _bases_and_ends(fingers: Sequence[Finger]) -> tuple[np.ndarray, np.ndarray]:
+    """[F, 3] the first joint and the tip of each finger."""
+    points = np.array([(finger.points[0], finger.points[-1]) for finger in fingers])
+    return points[:, 0], points[:, 1]
+
+
 def _beside_others(chains: list[Finger]) -> np.ndarray:
     """[F] from 0 to 2: how parallel the other fingers are, and how far a finger begins beside the line on which the
     others begin."""
-    bases = np.array([one.points[0] for one in chains])
-    ends = np.array([one.points[-1] for one in chains])
+    bases, ends = _bases_and_ends(chains)
     directions = (ends - bases) / np.linalg.norm(ends - bases, axis=1, keepdims=True)
     spreads = []
     beside = []
@@ -576,8 +580,7 @@ def _index_side(thumb: Finger, others: list[Finger]) -> tuple[np.ndarray, str]:
 
     It is the thumb's side. A thumb opposite the middle of the fingers has none; then it is that of a right hand.
     """
-    bases = np.array([finger.points[0] for finger in others])
-    ends = np.array([finger.points[-1] for finger in others])
+    bases, ends = _bases_and_ends(others)
     middle = bases.mean(axis=0)
     across = np.linalg.svd(bases - middle)[2][0]
     to_thumb = thumb.points[-1] - middle

@@ -371,21 +371,16 @@ def _turned(R: np.ndarray, quats: np.ndarray) -> np.ndarray:
     return turned.as_quat(scalar_first=True).astype(quats.dtype)
 
 
-def _start_height(demos: Demos, objects: Mapping[str, ObjectSpec]) -> np.ndarray:
-    """[S] height of the object's lowest vertex in each sequence's first frame [m]."""
-    heights = []
-    for name, pos, quat in zip(demos.object_name.tolist(), *demos.start_pose, strict=True):
-        heights.append(pos[2] - rest_height(objects[name], quat))
-    return np.array(heights)
-
-
 def grounded(demos: Demos, objects: Mapping[str, ObjectSpec]) -> Demos:
     """Shift every sequence along z so that its object's lowest vertex is at z = 0 in the first frame.
 
     A sequence whose object starts on top of something stays where it is, or its hand would reach into the table. The
     scene does not have what is below the object, so in physics the object first drops by that height.
     """
-    height = _start_height(demos, objects)
+    heights = []  # of the object's lowest vertex
+    for name, pos, quat in zip(demos.object_name.tolist(), *demos.start_pose, strict=True):
+        heights.append(pos[2] - rest_height(objects[name], quat))
+    height = np.array(heights)
     height[height > _ON_TABLE] = 0.0
     shift = np.zeros((demos.num_frames, 3))
     shift[:, 2] = -height[demos.sequence_of_frame]

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -147,31 +147,24 @@ def examine(
         camera: [4, 4] pose of the camera in the table frame that positions were converted with.
     """
     demos = levelled(demos)
-    jobs = []
-    for rows in batches(np.arange(len(demos)), small=_SMALL_BATCH, most=_BATCH):
-        part = demos.select(indices=rows)
-        jobs.append(_Job(part, surfaces or {}, camera))
+    rows = batches(np.arange(len(demos)), small=_SMALL_BATCH, most=_BATCH)
+    parts = [demos.select(indices=some) for some in rows]
+    findings_of = partial(_named_findings, surfaces=surfaces or {}, camera=camera)
     merged: dict[tuple[str, bool, str], Finding] = {}
-    for name, finding in chain.from_iterable(in_processes(_named_findings, jobs)):
+    for name, finding in chain.from_iterable(in_processes(findings_of, parts)):
         key = (finding.name, finding.wrong, finding.cause)
         first = merged.get(key, replace(finding, examined=len(demos)))
         merged[key] = replace(first, sequences=(*first.sequences, name))
     return sorted(merged.values(), key=lambda finding: not finding.wrong)
 
 
-class _Job(NamedTuple):
-    """The examination of some sequences; see :func:`examine`."""
-
-    demos: Demos
-    surfaces: Mapping[str, Surface]
-    camera: np.ndarray | None
-
-
-def _named_findings(job: _Job) -> list[tuple[str, Finding]]:
+def _named_findings(
+    demos: Demos, surfaces: Mapping[str, Surface], camera: np.ndarray | None
+) -> list[tuple[str, Finding]]:
     """Return what is found in each sequence, with the sequence's name."""
     found = []
-    for index, name in enumerate(job.demos.sequence_name.tolist()):
-        recording = _recording(job.demos, index, job.surfaces, job.camera)
+    for index, name in enumerate(demos.sequence_name.tolist()):
+        recording = _recording(demos, index, surfaces, camera)
         with np.errstate(all="ignore"):  # numbers of damaged files overflow
             found += [(name, finding) for finding in _findings(recording)]
     return found

@@ -267,22 +267,20 @@ def _contacts_at(
     # of the object's weight about the grasp
     lever = np.cross(from_com, approach)
     facing = facing_fingers[rows, 1:3].mean(axis=1)
-    found = []
-    for i, row in enumerate(rows):
-        # each term is divided by what makes a plan worse by 1
-        cost = (
-            effort
-            + np.linalg.norm(lever[i]) / 0.03
-            + np.linalg.norm(from_com[i]) / 0.06
-            + 0.5 * (4 - fingers[i])
-            + 3.0 * (2 - facing_thumb[row, 0] - facing[i])
-            + abs(min(depth[row], 0.03) - 0.03) / 0.02
-            + max(0.0, width[row] - 0.07) / 0.01
-        )
-        found.append(
-            Contacts(points=points[i], approach=approach, closing=closing, cost=float(cost))
-        )
-    return found
+    # each term is divided by what makes a plan worse by 1
+    cost = (
+        effort
+        + np.linalg.norm(lever, axis=1) / 0.03
+        + np.linalg.norm(from_com, axis=1) / 0.06
+        + 0.5 * (4 - fingers)
+        + 3.0 * (2 - facing_thumb[rows, 0] - facing)
+        + np.abs(np.minimum(depth[rows], 0.03) - 0.03) / 0.02
+        + np.maximum(width[rows] - 0.07, 0.0) / 0.01
+    )
+    return [
+        Contacts(points=own, approach=approach, closing=closing, cost=float(own_cost))
+        for own, own_cost in zip(points, cost, strict=True)
+    ]
 
 
 def fit_hand(solid: Solid, contacts: Contacts, side: str) -> Grasp:

@@ -464,8 +464,8 @@ class Kinematics:
         root: Any = self._library.broadcast_to(root, (*q.shape[:-1], 4, 4)).reshape(-1, 4, 4)
         rotations = {0: root[:, :3, :3]}
         positions = {0: root[:, :3, 3]}
-        axes = [self._zeros(len(root), 0, 3)]
-        origins = [self._zeros(len(root), 0, 3)]
+        axes = [root[:, :0, :3]]
+        origins = [root[:, :0, :3]]
         needed = self._above[list(wanted)].any(axis=0)
         for i, step in enumerate(self._steps, start=1):
             if not needed[i]:

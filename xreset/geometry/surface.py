@@ -153,12 +153,10 @@ class Surface:
         points = np.zeros_like(local)
         contact = np.zeros(local.shape[:2], dtype=bool)
         if close.any():
-            touched = np.zeros_like(local)
-            touched[close], gap = self.nearest(local[close])
+            points[close], gap = self.nearest(local[close])
             contact[close] = gap < distance
-            in_world = np.einsum("fij,fkj->fki", rotation, touched) + object_pos[:, None]
-            points[contact] = in_world[contact]
-        return points, contact
+        in_world = np.einsum("fij,fkj->fki", rotation, points) + object_pos[:, None]
+        return np.where(contact[..., None], in_world, 0.0), contact
 
 
 _KNOWN: dict[bytes, Surface] = {}

@@ -5,7 +5,7 @@ import json
 import re
 import subprocess
 from contextlib import redirect_stdout
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from unittest import TestCase
 from unittest.mock import Mock, patch
@@ -198,6 +198,34 @@ class PlanTest(Studied):
         (given,) = calls
         self.assertEqual(replace(given["config"], iterations=given["iterations"]), planned.config)
         self.assertEqual(list(flags({"config": {"a": {"b_c": True}}})), ["--config.a.b-c"])
+
+    def test_changes_of_terms_are_flags(self):
+        changes = """
+            [runs.a.config.task.reward]
+            terms.reach.width = 0.3
+            terms.reach_near = false
+            terms.wide = { function = "reach", weight = 0.5, width = 1.0 }
+            terms.action.limited = true
+            gate = { opposing = false, touching = { force = 0.2 } }
+            [runs.a.config.task.observation]
+            proprio.joint_mask = {}
+            policy.object_rotation = { function = "object_quat", noise = 0.02 }
+        """
+        plan = self.plan(f"{BASE}[runs.a]\nsteps = 1e6\nnum_envs = 64\n{changes}")
+        (train,) = (s for s in plan.steps.values() if s.kind == "train")
+        (command,) = train.todo()[1]
+        with calls_of(verbs, "train") as calls:
+            main(command[len(XRESET) :])
+        task = calls[0]["config"].task
+        (planned,) = plan.runs
+        self.assertEqual(
+            (task.reward.terms["reach"]["width"], "wide" in task.reward.terms), (0.3, True)
+        )
+        for part in ("reward", "observation"):
+            found, wanted = (
+                json.dumps(asdict(getattr(t, part))) for t in (task, planned.config.task)
+            )
+            self.assertEqual(found, wanted, "in the same order, which is that of the columns")
 
     def test_what_does_not_fit_is_refused(self):
         own = "terms = { 'module:term' = { weight = 1.0 } }\n"

@@ -31,6 +31,7 @@ from xreset.files.storage import file_hash
 from xreset.files.text import shown
 from xreset.learning.config import TrainConfig
 from xreset.learning.run import checkpoints, flat, read_run, training_left
+from xreset.task.terms import Terms
 
 XRESET = (sys.executable, "-P", "-m", "xreset")
 """Command line of ``xreset``. ``-P``: Python files in the current folder, which may be a download, are not imported."""
@@ -233,7 +234,7 @@ def train_todo(run: Run) -> Todo:
         recipe=spec.recipe,
         weights=run.weights,
         meshes=run.subset.meshes,
-        config=_with_tables(spec.config, TrainConfig()),
+        config=_as_options(spec.config, TrainConfig()),
     )
     return left, [command]
 
@@ -303,19 +304,30 @@ def is_evaluated(
     return is_same and hashes.items() <= found.inputs.items()
 
 
-def _with_tables(changes: dict[str, Any], config: Any) -> dict[str, Any]:
-    """Return nested changes of a configuration, with the fields that are tables as lists of names and values, which is
-    what their options take."""
+def _as_options(changes: dict[str, Any], config: Any) -> dict[str, Any]:
+    """Return nested changes of a configuration as its options take them: terms with words for true and false, other
+    tables as lists of names and values."""
     found = {}
     for name, value in changes.items():
         default = getattr(config, name)
-        if isinstance(default, dict):
+        if isinstance(default, Terms):
+            found[name] = _in_words(value)
+        elif isinstance(default, dict):
             found[name] = list(chain.from_iterable(value.items()))
         elif isinstance(value, dict):
-            found[name] = _with_tables(value, default)
+            found[name] = _as_options(value, default)
         else:
             found[name] = value
     return found
+
+
+def _in_words(terms: Any) -> Any:
+    """Return terms, which may be nested, with the words ``true`` and ``false``. One without parameters is ``true``."""
+    if isinstance(terms, dict) and terms:
+        return {name: _in_words(value) for name, value in terms.items()}
+    if terms == {} or isinstance(terms, bool):
+        return "false" if terms is False else "true"
+    return terms
 
 
 def _xreset(verb: str, *words: object, **options: Any) -> list[str]:

@@ -437,6 +437,10 @@ def read_traces(
         FileFormatError: the file is damaged, or its joints are not ``joint_names`` in that order, unless that is None.
     """
     path = folder / f"{engine}.trace.npz"
+    if not path.exists():
+        raise FileFormatError(
+            f"there is no {path}, which holds recorded episodes: xreset eval makes it, xreset stress does not."
+        )
     arrays = read_npz(
         path, TRACE_SCHEMA, _TRACE_FIELDS, what="an evaluation trace", check=_trace_problem
     )

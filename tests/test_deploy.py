@@ -174,7 +174,9 @@ class ToyTest(InFolder):
         self.assertTrue(set(shapes) <= set(self.contract["values"]))
         with self.assertRaisesRegex(XResetError, "is there already"):
             write_deployed(b"", self.out)
-        with self.assertRaisesRegex(LiveError, "has no object 'hat'. Choose from: brick"):
+        with self.assertRaisesRegex(
+            LiveError, "has no object 'hat'. Choose from: brick.*--object NAME"
+        ):
             self.controller.points("hat")
 
     def test_an_episode_that_does_not_fit_is_refused(self):

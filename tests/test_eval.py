@@ -508,6 +508,11 @@ class ResultsTest(InFolder):
         trace.write_bytes(trace.read_bytes()[:200])
         with self.assertRaisesRegex(FileFormatError, "cannot be read as an evaluation trace"):
             read_traces(self.folder, "mujoco", JOINTS)
+        trace.unlink()
+        with self.assertRaisesRegex(
+            FileFormatError, "xreset eval makes it, xreset stress does not"
+        ):
+            read_traces(self.folder, "mujoco", JOINTS)
 
     def test_what_cannot_be_played_is_refused(self):
         with self.assertRaisesRegex(PolicyError, "Linear.*expected a name, a path or a PolicySpec"):

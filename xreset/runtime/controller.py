@@ -250,7 +250,8 @@ class Controller:
         objects = self.contract.get("objects", {})
         if name not in objects:
             raise LiveError(
-                f"The contract has no object {str(name)[:60]!r}. Choose from: {', '.join(objects)}."
+                f"The contract has no object {str(name)[:60]!r}. Choose from: {', '.join(objects)}. For another one, "
+                "export the policy again: xreset export deploy POLICY --object NAME --meshes FOLDER."
             )
         return np.array(objects[name][entry], dtype=np.float32)
 

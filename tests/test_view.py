@@ -198,7 +198,7 @@ class Data(WithFiles):
             ("text.npz is not a file of xreset demos", FileFormatError, text, {}),
             ("demonstrations only", XResetError, self.demos, {"demos": self.demos}),
             ("for the robot 'openarm'", FileFormatError, self.bank, {"robot": "ur7e-sharpa"}),
-            ("no sequence 2", XResetError, self.retargeted, {}),
+            ("no sequence 2: the file has 2, counted from 0", XResetError, self.retargeted, {}),
         ):
             with refuses(self, words, kind):
                 load_view(path, **options).choose(sequence=2)

@@ -101,7 +101,7 @@ class View:
             count = len(self.sequence_name)
             if not 0 <= sequence < count:
                 raise XResetError(
-                    f"There is no sequence {sequence}: the file has {count}. Choose 0 to {count - 1}."
+                    f"There is no sequence {sequence}: the file has {count}, counted from 0."
                 )
             keep &= self.sequence == sequence
         if reason is not None:

@@ -183,7 +183,7 @@ class ToyTest(InFolder):
         points = np.array(self.contract["objects"]["brick"]["points"])
         for name, value, words in (
             ("target", self.home[1:], r"target has shape \(4,\), expected \(5,\)"),
-            ("goal_pos", [0.5, 0.3], r"shape \(2,\), expected \(3,\)"),
+            ("goal_pos", [0.5, 0.3], r"goal_pos has shape \(2,\), expected \(3,\)"),
             ("goal_quat", [1, 0, 0, 1], "expected a unit quaternion"),
             ("goal_quat", [float("nan")] * 4, "expected a unit quaternion"),
             ("target", [90.0] * 5, r"target of .* is 90, expected .* to .*\. Are these degrees"),

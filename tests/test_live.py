@@ -128,6 +128,8 @@ class FaultTest(TestCase):
             ("limit", after(1, joint_pos=np.array([0, 9.11])), "Joint finger is at 9.11, beyond its limit 9.00"),
             ("lower limit", after(1, joint_pos=np.array([-1.11, 0])), "Joint shoulder is at -1.11, beyond its limit -1.00"),
             ("no pose", after(1, object_pos=None), "object_pos is None. Without a new value, give the last one"),
+            ("millimetres", after(1, object_pos=np.array([500, 0, 100])), "old: newer ones hold .* more than 10 m"),
+            ("one joint", after(1, joint_pos=np.zeros(1)), r"could not read: joint_pos has shape \(1, 1\), expected \(1, 2\)\.$"),
             ("no cable", lambda t, r: refuse() if t > 1 else r, "The driver could not read: the cable is out"),
         ):  # fmt: skip
             with self.subTest(name), self.assertLogs("xreset", "WARNING") as logs:

@@ -15,7 +15,7 @@ from .driver import Array, Reading
 
 _MARGIN = 0.5
 """How far a target may be beyond a joint's limit when an episode begins [rad, m]."""
-_REACH = 10.0
+REACH = 10.0
 """Farthest place of an object, of a point of it, or of a goal [m]."""
 _FASTEST = 100.0
 """Largest velocity of a joint in a reading [rad/s, m/s]."""
@@ -183,31 +183,31 @@ class Controller:
         self._set_goal(pos, quat)
 
     def _set_goal(self, pos: Array, quat: Array) -> None:
-        goal_quat = self._of_each(quat, 4)
+        goal_quat = self._of_each("goal_quat", quat, 4)
         if not is_unit(goal_quat).all():
             raise LiveError(f"The goal has {quat}, expected a unit quaternion (w, x, y, z).")
-        self._given["goal_pos"] = self._positions("The goal", pos, 3)
+        self._given["goal_pos"] = self._positions("goal_pos", pos, 3)
         self._given["goal_quat"] = goal_quat
 
     def _must_have_begun(self) -> None:
         if not self._has_begun:
             raise LiveError("No episode has begun. Call begin first.")
 
-    def _of_each(self, values: Array, *shape: int) -> Array:
+    def _of_each(self, what: str, values: Array, *shape: int) -> Array:
         """[N, ...] values of every robot in float32, given those [N, ...] or one robot's [...]."""
         array = np.asarray(values, np.float32)
         try:
             return np.broadcast_to(array, (len(self.target), *shape))
         except ValueError:
-            raise LiveError(f"Found numbers of shape {array.shape}, expected {shape}.") from None
+            raise LiveError(f"{what} has shape {array.shape}, expected {shape}.") from None
 
     def _positions(self, what: str, values: Array, *shape: int) -> Array:
         """Return positions [m] of every robot, as :meth:`_of_each`; ``LiveError`` if one is far away or not finite."""
-        positions = self._of_each(values, *shape)
+        positions = self._of_each(what, values, *shape)
         farthest = np.abs(positions).max()
-        if not farthest <= _REACH:
+        if not farthest <= REACH:
             raise LiveError(
-                f"{what} has the coordinate {farthest:g}, expected at most {_REACH:g} m. Are these millimetres?"
+                f"{what} has the coordinate {farthest:g}, expected at most {REACH:g} m. Are these millimetres?"
             )
         return positions
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from .contract import LiveError
-from .controller import Controller, is_unit
+from .controller import REACH, Controller, is_unit
 from .driver import Array, Driver, Reading
 
 
@@ -57,7 +57,7 @@ class Outcome:
         reasons: [N] why each robot was stopped; None: the time was over.
         steps: control steps that the policy took.
         missed: control steps that were skipped because the step before took too long.
-        refused: [N] poses that were not used: not finite, or with a time stamp that ran backwards.
+        refused: [N] poses that were not used: not finite, far away, or with a time stamp that ran backwards.
     """
 
     reasons: list[str | None]
@@ -176,7 +176,7 @@ class Runner:
         try:
             self.driver.send(self._sent[0] if self._one_robot else self._sent)
         except Exception as error:
-            self._stop_all(f"The driver could not send targets: {error}.")
+            self._stop_all(f"The driver could not send targets: {_sentence(error)}")
             return False
         return True
 
@@ -195,10 +195,12 @@ class Runner:
         try:
             newest = self.driver.read()
             self._one_robot = np.ndim(newest.joint_pos) == 1
-            reading = self._merged(newest.batched(), now)
+            newest = newest.batched()
+            self._check_shapes(newest)
+            reading = self._merged(newest, now)
             self._reading = reading
         except Exception as error:
-            self._stop_all(f"The driver could not read: {error}.")
+            self._stop_all(f"The driver could not read: {_sentence(error)}")
             return self._sent
         self._check(reading, now)
         running = self._running
@@ -208,7 +210,7 @@ class Runner:
         try:
             target = self.controller.step(reading)
         except Exception as error:
-            self._stop_all(f"The policy could not act: {error}.")
+            self._stop_all(f"The policy could not act: {_sentence(error)}")
             return self._sent
         self.outcome.steps += 1
         sound = np.isfinite(target).all(axis=1)
@@ -232,6 +234,15 @@ class Runner:
             place = ", ".join(f"{value:.2f}" for value in links[robot, link])
             self._stop(int(robot), f"Link {name} is at ({place}), outside the workspace.")
 
+    def _check_shapes(self, reading: Reading) -> None:
+        """Raise ``LiveError`` if a reading has not as many numbers as the robot."""
+        robots, joints = self._sent.shape
+        shapes = {"joint_pos": joints, "joint_vel": joints, "object_pos": 3, "object_quat": 4}
+        for name, count in shapes.items():
+            value = getattr(reading, name)
+            if value is not None and value.shape != (robots, count):
+                raise LiveError(f"{name} has shape {value.shape}, expected {(robots, count)}.")
+
     def _merged(self, new: Reading, now: float) -> Reading:
         """Return a reading with the last sound values in place of its faulty ones."""
         joints_sound = _finite(new.joint_pos)
@@ -239,7 +250,7 @@ class Runner:
             joints_sound &= _finite(new.joint_vel)
         if new.tip_force is not None:
             joints_sound &= _finite(new.tip_force.reshape(len(joints_sound), -1))
-        pose_sound = _finite(new.object_pos) & is_unit(new.object_quat)
+        pose_sound = (np.abs(new.object_pos) <= REACH).all(axis=1) & is_unit(new.object_quat)
         old = self._reading
         if old is None:
             nothing = np.full(len(joints_sound), -np.inf)
@@ -251,7 +262,7 @@ class Runner:
         self._refusals[~not_ahead] = "newer ones have time stamps ahead of the robot's clock"
         self._refusals[~in_order] = "the time stamps of newer ones run backwards"
         self._refusals[~pose_sound] = (
-            "newer ones hold numbers that are not finite, or no unit quaternion"
+            f"newer ones hold numbers that are not finite, more than {REACH:g} m, or no unit quaternion"
         )
         usable = not_ahead & in_order & pose_sound
         self.outcome.refused += ~usable
@@ -310,6 +321,10 @@ class Runner:
             self.outcome.reasons[robot] = reason
             if len(self._stopped_at) == 1:
                 logging.getLogger("xreset").warning("The robot stops. %s", reason)
+
+
+def _sentence(error: Exception) -> str:
+    return f"{str(error).rstrip('.')}."
 
 
 def _finite(values: Array) -> Array:

@@ -394,16 +394,11 @@ class Kinematics:
         joints = [self._moving[row] for row in movers.rows]
         fixed = np.tile(np.eye(4), (len(chain), 1, 1))
         change = np.zeros((len(chain), 3, 4, 4))
-        coupling = self._coupling.new_zeros(len(chain), len(self.joint_names))
-        constant = self._coupling.new_zeros(len(chain))
         parents = [0]
         for row, link in enumerate(chain[1:], start=1):
             joint = self.tree.above[self.link_names[link]]
             parents.append(row_of[self._link_index[joint.parent]])
             fixed[row] = joint.T_parent_joint
-            if link in moving:
-                coupling[row] = self._coupling[moving[link]]
-                constant[row] = self._constant[moving[link]]
             if joint.type == "revolute":
                 K = np.cross(np.eye(3), joint.axis)  # K v = axis x v
                 change[row, 0, :3, :3] = K
@@ -415,9 +410,11 @@ class Kinematics:
         while above.any():
             ancestors.append(self._indices(above))
             above = above[above]
+        row_of_joint = [moving.get(link, -1) for link in chain]  # -1: the zeros that are added
+        pad = self._library.nn.functional.pad
         return _Chain(
-            coupling=coupling,
-            constant=constant,
+            coupling=pad(self._coupling, (0, 0, 0, 1))[row_of_joint],
+            constant=pad(self._constant, (0, 1))[row_of_joint],
             fixed=self.array(fixed),
             moving=self.array((fixed[:, None] @ change).reshape(len(chain), 3, 16)),
             ancestors=ancestors,
@@ -428,8 +425,7 @@ class Kinematics:
         )
 
     def _indices(self, values) -> Tensor:
-        array: Any = np.asarray(values, dtype=np.int64)
-        return array if self._library is np else self._library.as_tensor(array, device=self.device)
+        return self._library.as_tensor(values, device=self.device)
 
     def clamp(self, q: Tensor) -> Tensor:
         """[..., J] the nearest joint positions within the limits."""

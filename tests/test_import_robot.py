@@ -383,6 +383,7 @@ class Toy(Robots):
             ("5010 shapes. Use 5000 at most", "</body></worldbody>", _COPIES),
             ("Give the file that includes it", MJCF, "<mujocoinclude/>"),
             ("part of another file.* give that file", "<geom", '<geom class="of the scene"'),
+            ("not valid MJCF", "<geom", f'<geom class="{300 * "1"}"'),
             ("has no robot", MJCF, "<mujoco><worldbody><body name='a'/></worldbody></mujoco>"),
         ):
             with refuses(self, words, RobotError):

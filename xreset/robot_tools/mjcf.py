@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import subprocess
 import sys
@@ -141,7 +142,7 @@ def _compiled(path: Path, unit: str = "") -> mujoco.MjModel:
         done = subprocess.run(command, cwd=folder, capture_output=True, text=True, errors="replace")
         if done.returncode == 1 and "alloc" not in done.stdout:
             for name in re.findall("'([^']+)'", done.stdout):
-                if (path.parent / name).is_file():
+                if os.path.isfile(path.parent / name):  # a name may be too long for Path.is_file()
                     refuse_pointer(path.parent / name, RobotError)
             raise RobotError(
                 f"{path} is not valid MJCF: {done.stdout.strip()}. If it is a part of another file, such as a scene "

@@ -290,7 +290,8 @@ class WritePlacementTest(InFolder):
         self.assertEqual(place.call_args.args[3], PlaceConfig(rounds=1))
         rows = r"87\.6%\W+91\.2%\W+0\.500\W+0\.1000, 0\.2000, 0\.3000[\s\S]*75\.0%"
         self.assertRegex(said, rows)
-        self.assertIn("reaches: of a sample of their wrist poses, each on its own", said)
+        exact = f"{1e3 * placing._POSITION:g} mm and {np.degrees(placing._ORIENTATION):g} degrees"
+        self.assertIn(f"sample of their wrist poses, each on its own, to {exact}", said)
         self.assertEqual(load(self.folder).base_pos, self.best.robot.base_pos)
         self.assertIn("--write --search.rounds 1", self.lines(True)[0])
 

@@ -84,7 +84,7 @@ def _show_places(found: Sequence[Finalist], options: Mapping[str, Any]) -> None:
     console.print(f"arm at home in the best: {_digits(best.home[best.arm_indices])}")
     console.print(
         f"follows: share of {found[0].frames} annotated frames of {found[0].sequences} sequences, one after another; "
-        "reaches: of a sample of their wrist poses, each on its own"
+        "reaches: of a sample of their wrist poses, each on its own, to 5 mm and 5 degrees"
     )
     if options["write"]:
         console.print(f"wrote {robot_folder(options['robot']) / 'robot.toml'}")

@@ -415,7 +415,6 @@ def _ordered(name: str, links: list[Link], joints: list[Joint]) -> RobotTree:
             raise RobotError(
                 f"the joint name {joint.name!r} occurs twice. Rename one of the joints."
             )
-    for joint in joints:
         for end in (joint.parent, joint.child):
             if end not in link_by_name:
                 raise RobotError(
@@ -552,9 +551,8 @@ def _geometry(geometry: yourdfpy.Geometry, link: str, path: Path) -> Geometry:
         radius = float(geometry.cylinder.radius)
         size = (abs(radius), float(geometry.cylinder.length) / 2)
         return Geometry(kind="capsule" if radius < 0 else "cylinder", size=size)
-    if geometry.mesh is not None:
-        return _mesh_hull(geometry.mesh, link, path)
-    raise RobotError(f"link {link!r} has a collision without a geometry.")
+    assert geometry.mesh is not None, "yourdfpy refuses other shapes"
+    return _mesh_hull(geometry.mesh, link, path)
 
 
 def _mesh_hull(mesh: yourdfpy.Mesh, link: str, path: Path) -> Geometry:
@@ -570,12 +568,8 @@ def _mesh_hull(mesh: yourdfpy.Mesh, link: str, path: Path) -> Geometry:
             raise ObjectError("a vertex is not finite, or too far away")
         scale = 1.0 if mesh.scale is None else np.asarray(mesh.scale, dtype=float)
         return hull(vertices * np.broadcast_to(scale, 3), HULL_TOLERANCE).geometry
-    except ObjectError as error:
+    except (ObjectError, ValueError) as error:
         raise RobotError(f"link {link!r} uses the mesh {shown(name)}: {error}") from error
-    except ValueError as error:
-        raise RobotError(
-            f"link {link!r} uses the mesh {shown(name)}, which cannot be read: {shown(str(error))}"
-        ) from error
 
 
 def find_mesh(name: str, urdf: Path) -> Path | None:

@@ -401,6 +401,9 @@ class NpzTest(InFolder):
             (found["offsets"].dtype, found["points"].dtype), (np.dtype("=i8"), np.dtype("=f8"))
         )
         assert_array_equal(found["points"], ARRAYS["points"])
+        self.write(offsets=np.array([0, 1, 2**63], dtype=np.uint64))
+        with self.refused("more than 63 bits"):
+            self.read()
 
     def test_what_unpacks_to_too_much_is_refused_before(self):
         self.write(points=np.zeros((400_000, 3)), good=np.zeros(400_000, dtype=bool))
@@ -411,6 +414,9 @@ class NpzTest(InFolder):
         ):
             self.read()
         with patch.dict(os.environ, XRESET_MAX_FILE_MB="10"):
+            self.read()
+        self.write(offsets=np.zeros(1_500_000, dtype=np.int8))  # becomes int64
+        with patch.dict(os.environ, XRESET_MAX_FILE_MB="9"), self.refused("take 11 MB unpacked"):
             self.read()
         with (
             patch.dict(os.environ, XRESET_MAX_FILE_MB="many"),

@@ -140,30 +140,39 @@ def read_npz(
     path = Path(path)
     own = dict(schema)
     arrays: dict[str, np.ndarray] = {}
+    sizes: dict[str, int] = {}
     with _opened(path, what, f"cannot be read as {what}") as (archive, packed):
         if schema_name is not None:
             check_schema(path, _stated_schema(archive, packed), schema_name, what)
             own |= {"schema": Field((), "U"), "meta": Field((), "U", required=False)}
-        stored = {}
-        for name, field in own.items():
-            if name in packed:
-                stored[name] = name
-            elif field.earlier in packed:
-                stored[name] = field.earlier
-            elif field.required:
-                raise FileFormatError(
-                    f"{path} is not valid as {what}: it has no array {name!r}; "
-                    f"found {', '.join(sorted(set(packed) - {'schema'}))}."
-                )
-        _check_size(path, {name: packed[found] for name, found in stored.items()})
-        for name, found in stored.items():
-            arrays[name] = _native(path, name, np.asanyarray(archive[found]))
+        stored = {name: _stored_name(name, field, packed) for name, field in own.items()}
+        missing = [name for name, field in own.items() if field.required and not stored[name]]
+        if missing:
+            raise FileFormatError(
+                f"{path} is not valid as {what}: it has no array {missing[0]!r}; "
+                f"found {', '.join(sorted(set(packed) - {'schema'}))}."
+            )
+        present = {name: found for name, found in stored.items() if found is not None}
+        _check_size(path, {name: packed[found] for name, found in present.items()})
+        for name, found in present.items():
+            array = np.asanyarray(archive[found])
+            # the size of an item as _native gives it
+            sizes[name] = array.size * max(
+                array.dtype.itemsize, {"i": 8, "u": 8, "f": 4}.get(array.dtype.kind, 1)
+            )
+            _check_size(path, sizes)
+            arrays[name] = _native(path, name, array)
     problem = _wrong_shape(arrays, own) or wrong_value(arrays, schema)
     if problem is None and check is not None:
         problem = check(arrays)
     if problem is not None:
         raise FileFormatError(f"{path} is not valid as {what}: {problem}")
     return arrays
+
+
+def _stored_name(name: str, field: Field, packed: Mapping[str, int]) -> str | None:
+    """Return the name that a field has in a file, or None if the file lacks it."""
+    return next((found for found in (name, field.earlier) if found in packed), None)
 
 
 def npz_schema(path: str | Path, *, what: str = "one of xreset's npz files") -> str:
@@ -235,9 +244,11 @@ def _check_size(path: Path, sizes: Mapping[str, int]) -> None:
 
 def _native(path: Path, name: str, array: np.ndarray) -> np.ndarray:
     kind = array.dtype.kind
-    if kind not in "fiubU":
+    is_large = array.dtype == np.uint64 and (array > np.iinfo(np.int64).max).any()
+    if kind not in "fiubU" or is_large:
+        what = "integers of more than 63 bits" if is_large else array.dtype
         raise FileFormatError(
-            f"{path}: the array {name!r} holds {array.dtype}, expected numbers, bool or text."
+            f"{path}: the array {name!r} holds {what}, expected numbers, bool or text."
         )
     if kind in "iu":
         return array.astype(np.int64)

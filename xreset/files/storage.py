@@ -401,17 +401,20 @@ def must_exist(path: Path, what: str) -> None:
     """Refuse, with ``FileFormatError``, a path where no regular file is, or one that may not be read; ``what`` it ought
     to be is for the message."""
     try:
-        if not stat.S_ISREG(path.stat().st_mode):
-            raise FileFormatError(f"{path} is a folder or a device, expected a file ({what}).")
-        os.close(os.open(path, os.O_RDONLY))
+        mode = path.stat().st_mode
     except FileNotFoundError:
         raise FileFormatError(
             f"there is no {path} ({what}). Check the path, or make the file first."
         ) from None
-    # a name too long, a zero in the name, no right to read it, or too many open files
+    # a name too long, a folder that may not be entered, a zero in the name
     except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise FileFormatError(f"{shown(str(path))} cannot be read ({what}): {reason}.") from error
+        raise FileFormatError(f"there is no {shown(str(path))} ({what}): {error}.") from error
+    if not stat.S_ISREG(mode):
+        raise FileFormatError(f"{path} is a folder or a device, expected a file ({what}).")
+    try:
+        os.close(os.open(path, os.O_RDONLY))
+    except OSError as error:  # no right to read it, or too many open files
+        raise FileFormatError(f"{path} cannot be read: {error.strerror}.") from error
 
 
 def check_suffix(name: str, path: str | Path, suffix: str) -> None:

@@ -760,6 +760,11 @@ class Toy(Robots):
             (HAND, {"rpy": (0, 0, np.nan)}, "expected radians"),
         ):
             self.assertRaisesRegex(RobotError, words, self.imported, hand, **options)
+        with (
+            mock.patch.dict(os.environ, XRESET_MAX_FILE_MB="16"),
+            self.assertRaisesRegex(RobotError, "too large to describe a robot"),
+        ):
+            self.imported(HAND + (2 << 20) * " ")
         self.file("taken", "")
         with self.assertRaisesRegex(XResetError, "is there already"):
             make_robot(self.arm, self.hand, self.folder / "taken")

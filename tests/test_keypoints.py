@@ -2,10 +2,12 @@
 
 import csv
 import itertools
+import os
 import re
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
+from unittest import mock
 
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
@@ -226,6 +228,12 @@ class Synthetic(InFolder):
             path.write_text(text)
             with refuses(self, words, DemoError):
                 read_keypoints(path, PLAIN)
+        path.write_bytes(first.encode() + b"," * (2 << 20))
+        with (
+            mock.patch.dict(os.environ, XRESET_MAX_FILE_MB="1"),
+            refuses(self, "it has 2 MB, more than XRESET_MAX_FILE_MB", DemoError),
+        ):
+            read_keypoints(path, PLAIN)
 
     def test_comments_capitals_and_a_side_with_one(self):
         path = self.folder / "A.CSV"

@@ -381,9 +381,15 @@ class MeshImport(InFolder):
         accessor = {"componentType": 5126, "type": "VEC3", "count": 10**9}
         header = {"asset": {"version": "2.0"}, "accessors": [accessor]}
         (self.folder / "huge.gltf").write_text(json.dumps(header))
+        scene = trimesh.Scene()
+        sphere = trimesh.creation.icosphere(subdivisions=4)
+        for _ in range(100):
+            scene.add_geometry(sphere, geom_name="one")
+        scene.export(self.folder / "many.glb")
         for name, limit, words in (
             ("mesh.3mf", 16 << 20, "is an archive. Unpack it"),
             ("huge.gltf", 1 << 30, "takes 22888 MB"),
+            ("many.glb", 16 << 20, "takes 46 MB"),
         ):
             with (
                 patch("xreset.geometry.shapes.max_bytes", return_value=limit),

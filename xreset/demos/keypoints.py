@@ -27,6 +27,7 @@ from xreset.demos.hand import ORDERS, Order
 from xreset.errors import DemoError
 from xreset.files.checks import frozen, is_rigid
 from xreset.files.records import RATE, UNIT_TOLERANCE, Arrays, Field, read_npz
+from xreset.files.storage import max_bytes
 from xreset.files.text import is_plain, shown
 from xreset.geometry.shapes import transformed
 from xreset.objects.catalogue import official_name
@@ -220,6 +221,10 @@ def _read_csv(path: Path, name: str) -> Iterator[Arrays]:
 
 def _table(path: Path) -> dict[str, list[str]]:
     """Return the cells below each column's name. Lines that begin with # are comments."""
+    if path.stat().st_size > max_bytes():
+        raise ValueError(
+            f"it has {path.stat().st_size >> 20} MB, more than XRESET_MAX_FILE_MB allows"
+        )
     with open(path, newline="", encoding="utf-8-sig") as file:
         lines = csv.reader(file, strict=True)
         rows = [(lines.line_num, row) for row in lines if row and not row[0].startswith("#")]

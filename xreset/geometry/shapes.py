@@ -32,6 +32,8 @@ MANY_POINTS = 400_000
 _ROWS = 20_000
 """Points whose heights are computed together."""
 _ARCHIVES = (".zip", ".tar", ".gz", ".tgz", ".bz2", ".xz")
+_PER_VERTEX_BYTE = 8
+"""Bytes of memory of a mesh per byte of its vertices: faces, and copies on the way."""
 _POINTER = b"version https://git-lfs"
 """Beginning of the small text that Git has in place of a large file."""
 _GLTF_NUMBERS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
@@ -199,10 +201,16 @@ def load_mesh(path: Path) -> trimesh.Trimesh:
         size = path.stat().st_size
         if path.suffix.lower() in (".gltf", ".glb"):
             size = max(size, _gltf_size(path))
-        if size > max_bytes():
-            raise ObjectError(f"{path} takes {size >> 20} MB, more than XRESET_MAX_FILE_MB allows.")
+        _check_memory(path, size)
         # Processing would drop damaged vertices silently.
-        mesh = trimesh.load_scene(path, skip_materials=True, process=False).to_mesh()
+        scene = trimesh.load_scene(path, skip_materials=True, process=False)
+        sizes = [
+            scene.geometry[scene.graph[node][1]].vertices.nbytes
+            for node in scene.graph.nodes_geometry
+        ]
+        # a scene may show a mesh any number of times
+        _check_memory(path, _PER_VERTEX_BYTE * sum(sizes))
+        mesh = scene.to_mesh()
     except ObjectError:
         raise
     except Exception as error:  # trimesh's parsers raise any kind of error
@@ -219,6 +227,11 @@ def refuse_pointer(path: Path, error: type[XResetError] = ObjectError) -> None:
             raise error(
                 f"{path} is a Git LFS pointer, not the file itself. Run `git lfs pull` in its repository."
             )
+
+
+def _check_memory(path: Path, size: int) -> None:
+    if size > max_bytes():
+        raise ObjectError(f"{path} takes {size >> 20} MB, more than XRESET_MAX_FILE_MB allows.")
 
 
 def _gltf_size(path: Path) -> int:

@@ -23,6 +23,7 @@ import numpy as np
 
 from xreset.errors import ObjectError, RobotError
 from xreset.files.checks import frozen
+from xreset.files.storage import max_bytes
 from xreset.files.text import is_plain, shown
 from xreset.geometry.shapes import hull, load_mesh, refuse_pointer, shape_mesh, surface_of
 from xreset.spec import Geometry, MimicSpec, RobotSpec, Shape
@@ -279,6 +280,8 @@ def parse_xml(path: Path) -> Element:
     parser.EndElementHandler = builder.end
     parser.CharacterDataHandler = builder.data
     try:
+        if path.stat().st_size > max_bytes() // 16:
+            raise ValueError("it is too large to describe a robot")
         refuse_pointer(path, RobotError)
         parser.Parse(path.read_bytes(), True)
         root = builder.close()

@@ -96,7 +96,6 @@ class Contradiction(NamedTuple):
 class Recording:
     """One sequence of F frames in double precision."""
 
-    name: str
     side: str
     fps: float
     points: np.ndarray

@@ -204,7 +204,6 @@ def _recording(
     frames = demos.frames(index)
     seen = demos.hand_valid[frames]
     return Recording(
-        name=str(demos.sequence_name[index]),
         side=str(demos.hand_side[index]),
         fps=float(demos.fps),
         points=np.where(seen[:, None, None], demos.hand_keypoints[frames], np.nan).astype(float),

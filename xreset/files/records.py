@@ -145,16 +145,19 @@ def read_npz(
         if schema_name is not None:
             check_schema(path, _stated_schema(archive, packed), schema_name, what)
             own |= {"schema": Field((), "U"), "meta": Field((), "U", required=False)}
-        stored = {name: _stored_name(name, field, packed) for name, field in own.items()}
-        missing = [name for name, field in own.items() if field.required and not stored[name]]
-        if missing:
-            raise FileFormatError(
-                f"{path} is not valid as {what}: it has no array {missing[0]!r}; "
-                f"found {', '.join(sorted(set(packed) - {'schema'}))}."
-            )
-        present = {name: found for name, found in stored.items() if found is not None}
-        _check_size(path, {name: packed[found] for name, found in present.items()})
-        for name, found in present.items():
+        stored = {}
+        for name, field in own.items():
+            if name in packed:
+                stored[name] = name
+            elif field.earlier in packed:
+                stored[name] = field.earlier
+            elif field.required:
+                raise FileFormatError(
+                    f"{path} is not valid as {what}: it has no array {name!r}; "
+                    f"found {', '.join(sorted(set(packed) - {'schema'}))}."
+                )
+        _check_size(path, {name: packed[found] for name, found in stored.items()})
+        for name, found in stored.items():
             array = np.asanyarray(archive[found])
             # the size of an item as _native gives it
             sizes[name] = array.size * max(
@@ -168,11 +171,6 @@ def read_npz(
     if problem is not None:
         raise FileFormatError(f"{path} is not valid as {what}: {problem}")
     return arrays
-
-
-def _stored_name(name: str, field: Field, packed: Mapping[str, int]) -> str | None:
-    """Return the name that a field has in a file, or None if the file lacks it."""
-    return next((found for found in (name, field.earlier) if found in packed), None)
 
 
 def npz_schema(path: str | Path, *, what: str = "one of xreset's npz files") -> str:

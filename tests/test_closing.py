@@ -243,8 +243,12 @@ class FingersTest(TestCase):
         bend = ROBOT.joint_names.index("finger_b_bend")
         self.assertLessEqual(abs(far[0, bend]), 0.8)
         assert_array_equal(squeezed(0.0), joints)
+        bent = squeezed(1.0)[0, bend] - joints[0, bend]
         target = squeezed(50.0, with_drive(ROBOT, "jaw_a_slide", effort=0.8))
         self.assertAlmostEqual(target[0, JAW] - joints[0, JAW], -0.8 / 800, places=9)
+        force = 0.8 / (1 + 1.1)  # of each finger: no drive's torque alone is cut off
+        self.assertLess(bent, -1e-3)
+        self.assertAlmostEqual(target[0, bend] - joints[0, bend], force * bent, delta=1e-5)
 
 
 class TargetsTest(TestCase):

@@ -160,20 +160,27 @@ class FilterTest(TestCase):
         ):
             return make_bank(motion, self.robot, self.objects, **ONLY_FRAMES | options), tries
 
-    def test_targets_that_press_are_tried_with_the_same_objects_for_the_stated_steps(self):
-        """Three states come after contact; the last is out of bounds with targets that press."""
+    def test_targets_that_press_are_tried_with_less_and_less_force(self):
+        """Of the three states after contact, the first stays put with the whole force, the second with a quarter of it,
+        and the third with none."""
         bank, tries = self.tried(
-            [[-1] * 5, [-1, -1, 0]],
+            [[-1] * 5, [-1, 0, 0], [2, 2], [-1, 1]],
             limits=FilterConfig(steps=3),
             squeeze=SqueezeConfig(force=1.0),
         )
-        (names, plain, steps), (pressing_names, pressing, pressing_steps) = tries
+        self.assertEqual({steps for _, _, steps in tries}, {3})
+        (names, plain, _), *pressing = tries
         self.assertEqual(names, [SOUP] * 3 + [SPAM] * 2)
-        self.assertEqual(pressing_names, [SOUP, SPAM, SPAM])
-        self.assertEqual((steps, pressing_steps), (3, 3))
-        assert_allclose(pressing.object_pos, plain.object_pos[2:])
-        assert_allclose(pressing.joint_target, pressing.joint_pos + 0.25, rtol=1e-6)
-        pressed = np.array([0.0, 0.0, 0.25, 0.25, 0.0])[:, None]
+        for number, share, tried in (
+            (3, 1.0, pressing[0]),
+            (2, 0.5, pressing[1]),
+            (2, 0.25, pressing[2]),
+        ):
+            names, states, _ = tried
+            self.assertEqual(names, [SOUP, SPAM, SPAM][-number:])
+            assert_allclose(states.object_pos, plain.object_pos[-number:])
+            assert_allclose(states.joint_target, states.joint_pos + share * 0.25, rtol=1e-6)
+        pressed = np.array([0.0, 0.0, 0.25, 0.0625, 0.0])[:, None]
         assert_allclose(bank.targets, bank.joint_pos + pressed, rtol=1e-6)
 
     def test_an_engine_tries_what_the_one_before_accepts(self):

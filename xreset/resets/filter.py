@@ -32,6 +32,9 @@ from xreset.spec import (
     objects_named,
 )
 
+_SHARES = (1.0, 0.5, 0.25)
+"""Shares of the force with which fingers try to press, one after the other, until the object stays where it is."""
+
 
 def stable_states(
     retargeted: Retargeted,
@@ -70,10 +73,13 @@ def stable_states(
         touching = [values[rows] for values in poses]
         fingers = fingers_of(robot, scene.objects, object_name[rows], *touching)
         forces = grip_forces(fingers, squeeze.newtons(len(robot.fingertips)))
-        targets = squeeze_targets(robot, fingers, touching[0], forces)
-        states.joint_target[rows] = torch.as_tensor(targets, dtype=torch.float32)
-        refused = rows[find(object_name[rows], states[rows]) >= 0]
-        states.joint_target[refused] = states.joint_pos[refused]
+        beyond = squeeze_targets(robot, fingers, touching[0], forces) - touching[0]
+        push = torch.zeros_like(states.joint_pos)
+        push[rows] = torch.as_tensor(beyond, dtype=push.dtype)
+        for share in _SHARES:
+            states.joint_target[rows] = states.joint_pos[rows] + share * push[rows]
+            rows = rows[find(object_name[rows], states[rows]) >= 0]
+        states.joint_target[rows] = states.joint_pos[rows]
     work = len(engines) * len(shallow)
     progress(work, work)
 

@@ -150,9 +150,10 @@ def squeeze_targets(
     """Return drive targets [M, J] with which the fingers press, within joint limits and the drives' largest torques.
 
     A finger that presses on the object with a normal force f needs joint torques J^T f. A drive gives them where its
-    target is J^T f / kp beyond the joint. The rest of the balance is left to the drives, which are soft: the object
-    moves by millimetres until what it rests against presses back. Targets of joints that do not press are the joints'
-    positions.
+    target is J^T f / kp beyond the joint. If a drive is too weak for its torque, all fingers of the state press with
+    less: without the missing torque alone, they would no longer be in balance. The rest of the balance is left to the
+    drives, which are soft: the object moves by millimetres until what it rests against presses back. Targets of joints
+    that do not press are the joints' positions.
 
     Args:
         robot: robot of the states.
@@ -164,8 +165,10 @@ def squeeze_targets(
     kinematics = Kinematics(robot)
     jacobian = kinematics.jacobian(q, fingers.links, fingers.point).linear
     torque = torch.einsum("mgi,mgij->mj", force[..., None] * fingers.inward, jacobian)
+    torque[:, list(robot.is_arm)] = 0.0  # the arm stays where it is
     effort = torch.as_tensor(drive_values(robot, "effort"))
-    return pressing_targets(kinematics, q, torque.clamp(-effort, effort)).numpy()
+    possible = (effort / torque.abs()).amin(dim=1, keepdim=True).clamp_max(1.0)
+    return pressing_targets(kinematics, q, possible * torque).numpy()
 
 
 _LEVER = 0.05

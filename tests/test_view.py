@@ -32,6 +32,7 @@ from xreset.errors import FileFormatError, XResetError
 from xreset.geometry.kinematics import Kinematics
 from xreset.pictures.meshes import rgb, tint
 from xreset.pictures.render import write_png
+from xreset.pictures.verbs import view
 from xreset.pictures.view.colors import reason_color
 from xreset.pictures.view.load import load_view
 from xreset.pictures.view.page import Page
@@ -344,6 +345,17 @@ class Served(WithFiles):
         texts = list(root.itertext())
         self.assertEqual(texts[0], f"not valid: {name}")
         self.assertIn(f"sequence 0: {name}", texts)
+
+    def test_the_address_comes_with_what_is_counted(self):
+        for path, counted in ((self.demos, "frames"), (self.bank, "reset states")):
+            said = []
+            with (
+                mock.patch("xreset.pictures.view.page.Page") as opened,
+                mock.patch("xreset.pictures.view.server.serve_until_interrupted"),
+            ):
+                opened.return_value.url = "http://localhost:8080"
+                view(path, say=said.append)
+            self.assertRegex(said[0], rf"^\d+ sequences, \d+ {counted} at http://localhost:8080$")
 
     def test_the_command_serves_until_interrupted(self):
         command = [sys.executable, "-u", "-m", "xreset", "view", str(self.bank), "--port", "8960"]

@@ -94,7 +94,8 @@ def _serve(
 
     opened = page.Page(shown, host=host, port=port, sequence=sequence, frame=frame)
     number = opened.url.rpartition(":")[2]
-    say(f"{len(shown.sequence_name)} sequences, {len(shown.frame)} {shown.kind} at {opened.url}")
+    rows = "frames" if shown.is_motion else shown.kind
+    say(f"{len(shown.sequence_name)} sequences, {len(shown.frame)} {rows} at {opened.url}")
     tunnel = f"ssh -L {number}:localhost:{number} THIS_MACHINE"
     say(f"From another machine: {tunnel}, then open the same address. Ctrl-C ends.")
     server.serve_until_interrupted(opened)

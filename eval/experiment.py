@@ -170,7 +170,7 @@ def _warn_of_replaced(file: Path, trial: Trial) -> None:
     if what:
         logging.getLogger(__name__).warning(
             "%s: results of %s, which this evaluation replaces. To keep them, stop it now and choose another folder "
-            "(out).",
+            "(--out; in Python: out).",
             file,
             what,
         )

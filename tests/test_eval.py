@@ -606,6 +606,7 @@ class ResultsTest(InFolder):
                 evaluate(self.policy, "demos.npz", "mujoco")
             if told:
                 self.assertIn(told, logs.output[0])
+                self.assertIn("choose another folder (--out; in Python: out).", logs.output[0])
         self.assertEqual(file.read_bytes(), before)
 
     def test_a_result_that_is_not_a_number_is_not_written(self):

@@ -126,7 +126,7 @@ class Synthetic(InFolder):
         from_wrist = points - points[:, :1]
         swelling = np.linspace(0.4, 2.5, len(points))[:, None, None]
         for words, changed in (
-            ("Is the unit right", 1e3 * points),
+            (r"is \d+,\d{3} mm, .*Is the unit right", 1e3 * points),
             ("--order mano", written(points, "mano")),
             ("relative to the hand", points - points.mean(axis=1, keepdims=True)),
             ("The keypoints are not metric", points[:, :1] + swelling * from_wrist),

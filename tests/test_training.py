@@ -535,6 +535,7 @@ class TrainingTest(WithBank):
         without = self.folder / "without"
         for arguments in (f"{like}/without", resume):
             self.assertIn(f"add {naming}", said(arguments))
+        self.assertIn(f"add {naming} (in Python: to config).", said(resume))
         self.assertEqual(read_run(without).config.task.reward.own, {})
         self.assertEqual(len(checkpoints(stranger)), 2)
         self.assertNotIn("strangers_term", sys.modules)

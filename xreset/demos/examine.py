@@ -290,7 +290,7 @@ def _of_hand(r: Recording) -> Iterator[Finding]:
     if not _PALM[0] <= palm <= _PALM[1]:
         yield _error(
             "size",
-            f"From the wrist to the middle finger's knuckle it is {1e3 * palm:.3g} mm, expected 60 to 140 mm.",
+            f"From the wrist to the middle finger's knuckle it is {1e3 * palm:,.0f} mm, expected 60 to 140 mm.",
             "Is the unit right (--units)? Keypoints must be metric and in space, not those of an image.",
         )
     spread = np.median(bones.std(axis=0) / bones.mean(axis=0))

@@ -164,7 +164,7 @@ def resume(
     info = read_run(out)
     expected = info.config.task.reward.own
     if expected != dict(own or {}):
-        fix = f"add {own_terms_flags(expected)} (or own={expected})" if expected else "omit them"
+        fix = f"add {own_terms_flags(expected)} (in Python: to config)" if expected else "omit them"
         raise RunError(
             f"{out} was trained with {len(expected)} reward terms of your own, but {len(own or {})} were named. "
             f"A run folder must not decide which code is imported. If you trust this code, {fix}."

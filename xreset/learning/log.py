@@ -173,6 +173,7 @@ class _EventFile:
         from tensorboard.compat.proto.event_pb2 import Event  # pyright: ignore[reportMissingImports]
         from tensorboard.summary.writer.record_writer import RecordWriter
 
+        folder.mkdir(parents=True, exist_ok=True)
         self._event = Event
         self._file = RecordWriter((folder / f"events.out.tfevents.{time.time_ns()}").open("xb"))
         self._write(Event(wall_time=time.time(), file_version="brain.Event:2"))

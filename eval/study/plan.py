@@ -137,6 +137,7 @@ def make_plan(study: Study, name: str, *, given: Path, out: Path, only: Iterable
         raise RunError(
             f"the study has no runs {', '.join(unknown)}; it has {', '.join(study.runs)}."
         )
+    objects = {key: _objects_of(data, given) for key, data in study.data.items()}
     unavailable = {}
     for evaluation in study.evaluations.values():
         for engine in evaluation.engines:
@@ -147,7 +148,7 @@ def make_plan(study: Study, name: str, *, given: Path, out: Path, only: Iterable
         name=name,
         given=given,
         out=out,
-        objects={key: _objects_of(data, given) for key, data in study.data.items()},
+        objects=objects,
         unavailable=unavailable,
         parts={out / folder: None for folder in ("data", "reports")},
     )

@@ -364,7 +364,7 @@ def _order_problem(points: np.ndarray) -> str:
 
 
 def _fixed_point(r: Recording) -> str:
-    """Return what of the hand stays at one point while the object moves; empty if nothing does."""
+    """Return which part of the hand stays at one point while the object moves; an empty text if none does."""
     points = r.points[r.seen]
     still = np.ptp(r.pos[r.seen], axis=0).max() < MOVED
     if len(points) < 2 or still:

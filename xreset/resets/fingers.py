@@ -14,7 +14,6 @@ from torch import Tensor
 
 from xreset.files.checks import frozen
 from xreset.geometry.balls import link_balls
-from xreset.geometry.dynamics import drive_values
 from xreset.geometry.fields import DistanceFields
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import matvec, quat_rotate, quat_rotate_inverse
@@ -150,10 +149,9 @@ def squeeze_targets(
     """Return drive targets [M, J] with which the fingers press, within joint limits and the drives' largest torques.
 
     A finger that presses on the object with a normal force f needs joint torques J^T f. A drive gives them where its
-    target is J^T f / kp beyond the joint. If a drive is too weak for its torque, all fingers of the state press with
-    less: without the missing torque alone, they would no longer be in balance. The rest of the balance is left to the
-    drives, which are soft: the object moves by millimetres until what it rests against presses back. Targets of joints
-    that do not press are the joints' positions.
+    target is J^T f / kp beyond the joint (:func:`~xreset.resets.programs.pressing_targets`). The rest of the balance is
+    left to the drives, which are soft: the object moves by millimetres until what it rests against presses back.
+    Targets of joints that do not press are the joints' positions.
 
     Args:
         robot: robot of the states.
@@ -165,10 +163,7 @@ def squeeze_targets(
     kinematics = Kinematics(robot)
     jacobian = kinematics.jacobian(q, fingers.links, fingers.point).linear
     torque = torch.einsum("mgi,mgij->mj", force[..., None] * fingers.inward, jacobian)
-    torque[:, list(robot.is_arm)] = 0.0  # the arm stays where it is
-    effort = torch.as_tensor(drive_values(robot, "effort"))
-    possible = (effort / torque.abs()).amin(dim=1, keepdim=True).clamp_max(1.0)
-    return pressing_targets(kinematics, q, possible * torque).numpy()
+    return pressing_targets(kinematics, q, torque).numpy()
 
 
 _LEVER = 0.05

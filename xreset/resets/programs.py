@@ -82,6 +82,9 @@ def pressing_targets(kinematics: Kinematics, joint_pos: Tensor, torque: Tensor) 
     """Return drive targets [N, J] with which the hand's drives give torques where the object stops the joints: torque /
     stiffness beyond the joints, within the limits of the joints.
 
+    If a drive is too weak for its torque, the whole hand presses with less: without the missing torque alone, its
+    fingers would no longer be in balance.
+
     Args:
         kinematics: of the robot.
         joint_pos: [N, J] joints as the object stops them (rad, m).
@@ -90,5 +93,8 @@ def pressing_targets(kinematics: Kinematics, joint_pos: Tensor, torque: Tensor) 
     robot = kinematics.robot
     stiffness = torch.as_tensor(drive_values(robot, "kp"))
     presses = torch.as_tensor(~np.asarray(robot.is_arm)) & (stiffness > 0)
-    beyond = torch.where(presses, torque / stiffness.clamp_min(1e-9), 0.0)
+    torque = torch.where(presses, torque, 0.0)
+    effort = torch.as_tensor(drive_values(robot, "effort"))
+    possible = (effort / torque.abs()).amin(dim=-1, keepdim=True).clamp_max(1.0)
+    beyond = possible * torque / stiffness.clamp_min(1e-9)
     return torch.where(beyond != 0, kinematics.clamp(joint_pos + beyond), joint_pos)

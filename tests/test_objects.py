@@ -2,6 +2,7 @@
 
 import json
 import os
+import tracemalloc
 import zipfile
 from dataclasses import replace
 from unittest import TestCase
@@ -115,11 +116,22 @@ class Geometry(TestCase):
         self.assertLessEqual(plane_heights(points, half_spaces(few)).max(), 5e-4)
         self.assertLess(len(few.geometry.vertices), 200)
         self.assertTrue((few.geometry.vertices[:, None] == points).all(axis=-1).any(axis=1).all())
-        many = {"MANY_POINTS": 1000, "_ROWS": 900}  # without the exact hull
+        many = {"MANY_POINTS": 1000, "_SAMPLE": 900}  # without the exact hull
         with patch.multiple("xreset.geometry.shapes", **many):
             quick = hull(points, 5e-4)
         self.assertLessEqual(plane_heights(points, half_spaces(quick)).max(), 5e-4)
         self.assertLess(len(quick.geometry.vertices), 200)
+
+    def test_hull_of_many_points_fits_a_cache(self):
+        points = ellipsoid()
+        with patch("xreset.geometry.shapes._HEIGHTS", 10**9):
+            at_once = hull(points, 5e-5)
+        tracemalloc.start()
+        in_parts = hull(points, 5e-5)
+        _, peak = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+        assert_array_equal(in_parts.geometry.vertices, at_once.geometry.vertices)
+        self.assertLess(peak, 10e6)  # all heights together take 158 MB
 
     def test_winding_number_counts_overlaps(self):
         a = trimesh.creation.box((2, 2, 2))

@@ -29,8 +29,10 @@ _MOST_HULL_POINTS = 300
 """Number of points in a hull that every engine accepts."""
 MANY_POINTS = 400_000
 """Points of a mesh from which its exact hull takes too long."""
-_ROWS = 20_000
-"""Points whose heights are computed together."""
+_SAMPLE = 20_000
+"""Points from which the hull of very many starts."""
+_HEIGHTS = 200_000
+"""Heights of points above planes that are computed together: as many as fit a processor's cache."""
 _ARCHIVES = (".zip", ".tar", ".gz", ".tgz", ".bz2", ".xz")
 _PER_VERTEX_BYTE = 8
 """Bytes of memory of a mesh per byte of its vertices: faces, and copies on the way."""
@@ -157,24 +159,25 @@ def outermost(points: np.ndarray, tolerance: float) -> np.ndarray:
         directions = np.array([d for d in np.ndindex(3, 3, 3) if d != (1, 1, 1)]) - 1.0
         chosen = np.unique((points @ directions.T).argmax(axis=0))
     else:
-        first = outermost(points[:: len(points) // _ROWS + 1], tolerance)
+        first = outermost(points[:: len(points) // _SAMPLE + 1], tolerance)
         points = np.concatenate((first, points))
         chosen = np.arange(len(first))
     beyond_hull = np.arange(len(points))
     while True:
         planes = ConvexHull(points[chosen]).equations
+        number = np.arange(len(planes))
         farthest = np.zeros(len(planes), dtype=np.int64)
         worst = np.full(len(planes), -np.inf)
         still = []
-        for begin in range(0, len(beyond_hull), _ROWS):
-            part = beyond_hull[begin : begin + _ROWS]
-            beyond = plane_heights(points[part], planes)
-            rows = beyond.argmax(axis=0)
-            heights = beyond[rows, np.arange(len(planes))]
+        for part in np.array_split(beyond_hull, len(beyond_hull) * len(planes) // _HEIGHTS + 1):
+            # planes first: the points of each plane are next to each other in memory
+            beyond = planes[:, :3] @ points[part].T + planes[:, 3:]
+            rows = beyond.argmax(axis=1)
+            heights = beyond[number, rows]
             better = heights > worst
             worst[better] = heights[better]
             farthest[better] = part[rows[better]]
-            still.append(part[beyond.max(axis=1) > tolerance])
+            still.append(part[beyond.max(axis=0) > tolerance])
         beyond_hull = np.concatenate(still)
         if not len(beyond_hull):
             return points[chosen]

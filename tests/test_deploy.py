@@ -29,6 +29,7 @@ from tests.data import InFolder, refuses
 from tests.test_examples import EXAMPLES, run
 from tests.toy_bank import SOUP
 from tests.toy_policy import write_policy
+from tests.toy_robot import endless_robot
 from xreset import (
     CameraConfig,
     TaskConfig,
@@ -450,6 +451,35 @@ class ToyTest(InFolder):
         for a, b in zip(first, second, strict=True):
             assert_allclose(a.joint_target, b.joint_target, atol=1e-5)
             assert_allclose(a.object_pos, b.object_pos, atol=1e-4)
+
+
+class EndlessTest(InFolder):
+    def test_a_joint_may_turn_without_limits(self):
+        robot = endless_robot(self.folder)
+        controller = Controller(deployed_graph(Still(), robot, evaluation_task(TaskConfig())))
+        turned = 100.0
+        start = np.float32(robot.home)
+        start[0] = turned
+        nowhere = np.zeros(3)
+        upright = np.array([1.0, 0, 0, 0])
+        controller.begin(np.zeros(controller.shapes["object_points"]), nowhere, upright, start)
+        reading = Reading(
+            joint_pos=start,
+            joint_vel=np.zeros_like(start),
+            joint_time=0.0,
+            object_pos=np.float32(nowhere),
+            object_quat=np.float32(upright),
+            object_time=0.0,
+        )
+        controller.check_reading(reading)
+        self.assertEqual(controller.step(reading)[0, 0], turned)
+
+
+class Still(torch.nn.Module):
+    """A network whose actions are 0, for seven joints."""
+
+    def forward(self, flat, cloud):
+        return 0.0 * flat[:, :7] + 0.0 * cloud.flatten(1)[:, :1]
 
 
 class RefusedTest(TestCase):

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import torch
 
-from xreset.geometry.description import read_description
+from xreset.geometry.description import load_robot, read_description
 from xreset.geometry.rotations import quat_from_axis_angle
 
 ROBOTS = Path(__file__).with_name("robots")
@@ -22,6 +22,16 @@ def toy_hand_arm(folder):
     """The test robot, whose files are copied into ``folder``."""
     shutil.copytree(ROBOTS, folder, dirs_exist_ok=True)
     return read_description(folder / "toy.toml")
+
+
+def endless_robot(folder):
+    """A built-in robot whose first joint turns without limits, copied into ``folder``."""
+    described = load_robot("ur7e-robotiq")
+    shutil.copytree(described.urdf.parent, folder, dirs_exist_ok=True)
+    urdf = folder / described.urdf.name
+    name = f'name="{described.joint_names[0]}" type='
+    urdf.write_text(urdf.read_text().replace(f'{name}"revolute"', f'{name}"continuous"'))
+    return load_robot(folder)
 
 
 def toy_motion(model, generator, *, margin, turn):

@@ -116,10 +116,11 @@ def _joints(robot: RobotSpec, task: TaskConfig) -> list[dict[str, Any]]:
     rows = []
     for i, joint in enumerate(robot.joints):
         in_tree = tree.joint(joint.name)
+        is_continuous = in_tree.type == "revolute" and math.isinf(in_tree.upper - in_tree.lower)
         row: dict[str, Any] = {
             "name": joint.name,
             "group": joint.group,
-            "type": in_tree.type,
+            "type": "continuous" if is_continuous else in_tree.type,
             "velocity": in_tree.velocity,
             "home": joint.home,
         }

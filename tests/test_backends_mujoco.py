@@ -16,7 +16,7 @@ import torch
 import warp as wp
 from mujoco_warp._src import collision_driver, constraint, solver
 from mujoco_warp._src.types import CollisionType, GeomType
-from numpy.testing import assert_allclose, assert_array_equal
+from numpy.testing import assert_array_equal
 from torch import tensor
 from torch.testing import assert_close
 
@@ -88,19 +88,6 @@ class Model(InFolder):
     def setUpClass(cls):
         cls.scene = scene()
         cls.at = compile_scene(cls.scene, 0)
-
-    def test_drives_pull_with_their_stiffness_also_where_joints_are_coupled(self):
-        at = self.at
-        robot = self.scene.robot
-        data = mujoco.MjData(at.model)
-        q = robot.home + 0.01
-        off = np.linspace(-1e-4, 1e-4, len(q))
-        data.qpos[at.qpos], _ = at.joints.spread(q, np.zeros_like(q))
-        data.ctrl[:] = q + off
-        mujoco.mj_forward(at.model, data)
-        assert_allclose(
-            data.actuator_force, off * [joint.drive.kp for joint in robot.joints], atol=1e-9
-        )
 
     def collisions(self, **changes):
         robot = replace(self.scene.robot, **changes)
@@ -197,9 +184,6 @@ class Model(InFolder):
 
 class MujocoTest(EngineChecks, TestCase):
     backend_class = MujocoBackend
-    # MuJoCo's dry friction is soft: a joint that it holds creeps.
-    test_dry_friction_stops_and_holds = None
-    test_dry_friction_holds_against_a_weak_drive_only = None
 
 
 class Creep(TestCase):

@@ -3,6 +3,7 @@
 import io
 import json
 import os
+import re
 import subprocess
 import sys
 import zipfile
@@ -16,9 +17,10 @@ from unittest.mock import Mock, patch
 
 import tyro
 
-from tests.command import calls_of, refused
+from tests.command import calls_of, refused, succeeds
 from tests.command import xreset as run
 from tests.data import InFolder
+from xreset.backends import pybullet
 from xreset.cameras.config import WRIST
 from xreset.cli import COMMANDS, _terminal
 from xreset.cli._options import RULES, checked
@@ -121,12 +123,10 @@ class UsageTest(TestCase):
                 r"--seed is -1, expected a whole number from 0 to 4294967295",
                 "demos synth --out x.npz --seed -1",
             ),
-            (r"--seed is 9{20}, expected", "eval zero --demos none.npz --seed " + "9" * 20),
             (
                 r"--port is 87990, expected a whole number from 0 to 65535",
                 "view none.npz --port 87990",
             ),
-            (r"--num-envs is 0, expected a whole number above 0", "train --out x --num-envs 0"),
             (
                 r"episode_seconds is -1.0, expected a number from 0.0167, which is one control step",
                 "eval zero --robot openarm --demos none.npz --episode-seconds -1",
@@ -146,10 +146,6 @@ class UsageTest(TestCase):
             (r"--png is x\.xyz, expected a name that ends in \.png", "view d.npz --png x.xyz"),
             (r"--mp4 is x, expected a name that ends in \.mp4", "view d.npz --mp4 x"),
             (r"--picture is x\.jpg, expected", "robots check openarm --picture x.jpg"),
-            (
-                r"Unknown property 'pose-dely'\. Choose from: .*tracker-interval, pose-delay",
-                "stress soup-can --property pose-dely",
-            ),
             (r"Nothing was overwritten", "retarget d.npz --robot openarm --out ./d.npz"),
         ):
             with self.subTest(arguments[:80]):
@@ -169,6 +165,13 @@ class UsageTest(TestCase):
         for words, told in (
             ("engines check --backend bulet", ["--backend is now --engine"]),
             ("engines compare none --only mug", ["--only is now --object"]),
+            (
+                "train --resume --out none",
+                [
+                    "--resume is gone: a training continues with --out RUN alone",
+                    "no run to continue",
+                ],
+            ),
             ("objects list --objects=none", ["--objects is now --meshes", "no folder 'none'"]),
             ("demos synth --out x.npz --objects nothing", ["Unknown object 'nothing'"]),
         ):
@@ -225,7 +228,6 @@ class UsageTest(TestCase):
         for words, told in (
             ("--recipe paper", "follows from its teacher. Omit recipe"),
             ("--weights y", "Omit weights"),
-            ("--camera rear", "Unknown camera 'rear'"),
         ):
             self.assertIn(told, refused(*student.split(), *words.split()))
         with calls_of(verbs, "train") as calls:
@@ -317,18 +319,17 @@ class UsageTest(TestCase):
         self.assertRegex(output_of(code), words)
 
     def test_a_missing_engine_is_named_with_the_command_that_installs_it(self):
-        code = (
-            "import sys; sys.modules['pybullet'] = None; from xreset.backends import pybullet as ours\n"
-            "from xreset.cli import main\n"
-            "for ours._NEWEST_PYTHON in ((3, 99), (3, 9)): main(['engines', 'list'])"
-        )
         here = ".".join(map(str, sys.version_info[:2]))
-        without_wheel = (
-            rf"no: PyBullet has no wheel for Python {here}\. Use Python 3\.9, or another"
-        )
-        said = output_of(code)
-        for words in (r"no: .*pip install 'xreset\[pybullet\]'", without_wheel):
-            self.assertRegex(said, f"pybullet .* {words}")
+        self.enterContext(patch.dict(sys.modules, pybullet=None))
+        self.enterContext(patch.object(pybullet, "_engine", pybullet._engine.__wrapped__))
+        self.enterContext(patch("xreset.cli.engines.backend_names", return_value=["pybullet"]))
+        for newest, words in (
+            ((3, 99), r"pip install 'xreset\[pybullet\]'"),
+            ((3, 9), rf"PyBullet has no wheel for Python {here}\. Use Python 3\.9, or another"),
+        ):
+            with patch.object(pybullet, "_NEWEST_PYTHON", newest):
+                said = re.sub(r"[\s│]+", " ", succeeds("engines", "list"))
+                self.assertRegex(said, f"pybullet - - no: .*{words}")
 
     def test_naming_engines_replaces_the_default(self):
         for given, expected in (

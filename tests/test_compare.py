@@ -14,12 +14,12 @@ from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from torch.utils.tensorboard import SummaryWriter
 
-from tests.command import refused, succeeds
+from tests.command import succeeds
 from tests.data import refuses
 from tests.toy_bank import SOUP, SPAM
 from tests.toy_results import ENGINES, InFolder, rollouts_with, toy_episode, toy_rollouts
 from xreset import TrainConfig
-from xreset.errors import FileFormatError, RunError, XResetError
+from xreset.errors import FileFormatError, RunError
 from xreset.eval.metrics import METRICS
 from xreset.eval.plots import COLORS
 from xreset.eval.report.curves import amounts, draw_lines, line
@@ -34,7 +34,6 @@ from xreset.eval.stats import (
     difference_p,
     holm,
 )
-from xreset.eval.verbs import make_report
 from xreset.learning.clock import Lift, Passing, write_lift
 from xreset.task.config import ResetConfig, TaskConfig, TerminationConfig
 
@@ -580,14 +579,6 @@ class WrittenTest(Compared):
             ):
                 self.compare(name, curves=[curve])
 
-    def test_nothing_is_half_written(self):
-        a = self.write_results("a")
-        blocked = self.folder / "file"
-        blocked.write_text("")
-        with self.assertRaisesRegex(XResetError, "cannot make the folder"):
-            make_report([str(a)], blocked / "out")
-        self.assertEqual(blocked.read_text(), "")
-
 
 class DrawTest(Compared):
     def draw(self, function, *arguments, **options):
@@ -633,9 +624,3 @@ class CommandTest(Compared):
         self.assertEqual(first[columns[:4]].tolist(), expected)
         self.assertAlmostEqual(first["mean"], 0.4975)
         self.assertLess(first["low"], first["mean"])
-
-    def test_mistakes_are_one_line(self):
-        self.assertRegex(
-            refused("report", f"{self.folder}/x").strip(),
-            "^xreset report: The folder [^\n]* does not exist[^\n]*$",
-        )

@@ -45,7 +45,7 @@ from xreset.live.engine import EngineDriver
 from xreset.live.graph import policy_graph
 from xreset.policy.onnx_policy import OnnxPolicy, policy_contract
 from xreset.runtime import Controller, LiveError, Reading, load_controller
-from xreset.runtime.contract import KEY
+from xreset.runtime.contract import KEY, parse_contract
 from xreset.task.config import ObservationConfig, evaluation_task
 
 POLICY = "soup-can"
@@ -224,13 +224,13 @@ class ToyTest(InFolder):
                 controller.check_reading(replace(reading, **{name: value}))
 
     def changed(self, place, value):
-        """The graph, whose contract has another value at a place."""
+        """The text of the contract with another value at a place."""
         contract = json.loads(json.dumps(self.contract))
         entry = contract
         for name in place[:-1]:
             entry = entry[name]
         entry[place[-1]] = value
-        return self.with_metadata(json.dumps(contract))
+        return json.dumps(contract)
 
     def with_metadata(self, text):
         model = onnx.load_from_string(self.graph)
@@ -238,7 +238,7 @@ class ToyTest(InFolder):
         return model.SerializeToString()
 
     def test_a_contract_that_no_robot_may_follow_is_refused(self):
-        Controller(self.changed(("about",), "an entry of one's own"))
+        parse_contract({KEY: self.changed(("about",), "an entry of one's own")}, "It")
         joint = ("joints", 1)
         for place, values in (
             (("control_dt",), (1e-30, -0.016, True, 50.0, None)),
@@ -250,15 +250,17 @@ class ToyTest(InFolder):
             ((*joint, "velocity"), (-1.0, "x")),
             (("fingertips",), (3,)),
             (("objects", "brick"), ({}, 3)),
-            (("objects", "brick", "points"), ([[0, 0, float("nan")]] * 64, [], [[0, 0, 0]] * 63)),
+            (("objects", "brick", "points"), ([[0, 0, float("nan")]] * 64, [])),
             (("schema",), ("xreset-deploy/9",)),
         ):
             *_, last = (part for part in place if isinstance(part, str))
             for value in values:
                 with self.subTest(place, value=value), self.assertRaisesRegex(LiveError, last):
-                    Controller(self.changed(place, value), "It")
+                    parse_contract({KEY: self.changed(place, value)}, "It")
 
     def test_another_version_and_damage_are_refused(self):
+        fewer = self.changed(("joints",), self.contract["joints"][1:])
+        few_points = self.changed(("objects", "brick", "points"), [[0, 0, 0]] * 63)
         for content, words in (
             (self.network.read_bytes(), "no metadata entry 'xreset-deploy': it is not a deployed"),
             (
@@ -268,7 +270,8 @@ class ToyTest(InFolder):
             (self.with_metadata("{" * 50_000), "has a contract that is not JSON"),
             (self.graph[:5000], "It cannot be read as ONNX"),
             (b"", "It cannot be read as ONNX"),
-            (self.changed(("joints",), self.contract["joints"][1:]), "has the input 'joint_pos'"),
+            (self.with_metadata(fewer), "has the input 'joint_pos'"),
+            (self.with_metadata(few_points), "points"),
         ):
             with refuses(self, words, LiveError):
                 Controller(content, "It")

@@ -252,29 +252,29 @@ class TrainingTest(InOneFolder):
         with quickly():
             return evaluate(self.out, bank, robot=name, episodes=1, episode_seconds=0.1)
 
-    def test_the_graph_of_each_robot_gives_the_targets_of_the_policy(self):
-        for name in ARMS:
-            robot = robots.load(name)
-            spec = load_policy(self.out, robot=name)
-            objects = load_objects((SOUP, "010_potted_meat_can"), None)
-            with quickly():
-                env = spec.make_env(objects, bank_at_home(robot), num_envs=2)
-            self.addCleanup(env.close)
-            policy = spec.begin(env)
-            graph = GraphPolicy(Controller(spec.graph))
-            graph.begin(env)
-            for _ in range(3):
-                observations = env.get_observations()
-                actions = (policy.act(observations), graph.act(observations))
-                targets = []
-                for action in actions:
-                    self.assertEqual(action.shape, (2, 12))
-                    own = action[:, env.slots.of_joint]
-                    joint_pos = env.backend.state().joint_pos
-                    targets.append(env.actions.targets(own, env.joint_target, joint_pos))
-                assert_close(*targets, rtol=0, atol=1e-4)
-                self.assertGreater((targets[0] - env.joint_target).abs().max(), 1e-3)
-                env.advance(actions[0])
+    def test_the_graph_of_a_robot_gives_the_targets_of_the_policy(self):
+        """Of the second one: an export takes seconds, and the first is what a policy of one robot is."""
+        robot = robots.load(ARMS[1])
+        spec = load_policy(self.out, robot=robot.name)
+        objects = load_objects((SOUP, "010_potted_meat_can"), None)
+        with quickly():
+            env = spec.make_env(objects, bank_at_home(robot), num_envs=2)
+        self.addCleanup(env.close)
+        policy = spec.begin(env)
+        graph = GraphPolicy(Controller(spec.graph))
+        graph.begin(env)
+        for _ in range(3):
+            observations = env.get_observations()
+            actions = (policy.act(observations), graph.act(observations))
+            targets = []
+            for action in actions:
+                self.assertEqual(action.shape, (2, 12))
+                own = action[:, env.slots.of_joint]
+                joint_pos = env.backend.state().joint_pos
+                targets.append(env.actions.targets(own, env.joint_target, joint_pos))
+            assert_close(*targets, rtol=0, atol=1e-4)
+            self.assertGreater((targets[0] - env.joint_target).abs().max(), 1e-3)
+            env.advance(actions[0])
 
     def test_a_training_of_one_robot_goes_on_from_several(self):
         with quickly():

@@ -292,7 +292,9 @@ class LaunchTest(Studied):
             (self.folder / f"{name}.py").write_text("open('imported', 'w')")
         step = self.plan(BASE + "[runs.a]\n").steps["train a-seed0"]
         (command,) = step.todo()[1]
-        subprocess.run([*command, "--help"], cwd=self.folder, check=True, capture_output=True)
+        self.assertEqual(tuple(command[: len(XRESET)]), XRESET)
+        words = (*XRESET, "demos", "synth", "--help")  # sooner than a training
+        subprocess.run(words, cwd=self.folder, check=True, capture_output=True)
         self.assertFalse((self.folder / "imported").exists())
 
 

@@ -480,16 +480,6 @@ class TrainingTest(WithBank):
         self.assert_resumed(f"train --out {nothing} --seed 0", words)
         self.assertFalse(nothing.exists())
 
-    def test_the_flag_that_continued_a_run_is_not_needed(self):
-        words = "--resume is gone: a training continues with --out RUN alone"
-        with (
-            patch("xreset.learning.train.resume") as resumed,
-            redirect_stderr(io.StringIO()) as said,
-        ):
-            main(["train", "--resume", "--out", str(self.out), "--iterations", "3"])
-        self.assertIn(words, said.getvalue())
-        resumed.assert_called_once_with(self.out, own=None, iterations=3, minutes=None, wandb=None)
-
     def test_a_number_of_iterations_that_has_passed_does_not_shorten_a_run(self):
         """The policy is exported where that is missing."""
         out = self.train("long")
@@ -678,9 +668,6 @@ class TrainingTest(WithBank):
             (f"folder above has one: give {self.out}", {"weights": self.out / "checkpoints"}),
             ("this training has no teacher", {"config": idle}),
             ("Both recipe and config", {"recipe": "minutes"}),
-            ("^num_envs is 0", {"num_envs": 0}),
-            ("^minutes is 0", {"minutes": 0.0, "bank": toy_bank(self.robot)}),
-            ("Unknown device 'quantum'", {"device": "quantum"}),
             ("'mujoco' does not run on 'cuda'|can use 0 GPUs", {"device": "cuda"}),
             ("needs a reset bank .--resets., a goal set .--goals., or both", {"bank": None}),
             ("the goal set for 'ur7e-sharpa'", {"goals": toy_goals(robots.load("ur7e-sharpa"))}),

@@ -400,7 +400,8 @@ def export_episodes(
         What was written.
 
     Raises:
-        RunError: a folder does not exist, none holds episodes of the engines, or robots or rates differ.
+        RunError: a folder does not exist, none holds episodes of the engines, robots or rates differ, or the task has
+            another placeholder.
         XResetError: pyarrow or the encoder of films is missing, the folder is not empty, or it cannot be written.
     """
     from xreset.eval.export.lerobot import write_lerobot

@@ -104,6 +104,19 @@ class Episodes(Case):
         self.assertIn("demonstration 0 is left out", log.output[0])
         self.assertEqual(list(map(len, recording.episodes["action"])), [5])
 
+    def test_a_task_with_an_unknown_placeholder_is_refused(self):
+        folder = self.evaluate()
+        out = self.folder / "set"
+        for task, words in (
+            ("Bring {obj}.", r"Unknown placeholder '\{obj\}' in the task 'Bring .*\{object\}, the"),
+            ("Bring {}.", r"Unknown placeholder '\{\}'"),
+            ("Bring {object", r"Unknown placeholder '\{object'"),
+            ("", "The task is empty"),
+        ):
+            with refuses(self, words, RunError):
+                xreset.export_episodes(folder, out, task=task)
+        self.assertFalse(out.exists())
+
     def test_refusals(self):
         def changed(name, **changes):
             return self.evaluate(

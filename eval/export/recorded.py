@@ -6,6 +6,7 @@ Shape letters: T frames, J actuated joints.
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ from xreset.eval.stats import Table
 from xreset.files.checks import frozen
 from xreset.files.records import write_npz
 from xreset.files.storage import file_hash
-from xreset.files.text import short_name
+from xreset.files.text import short_name, shown
 from xreset.geometry.description import load_robot
 from xreset.spec import RobotSpec
 
@@ -83,13 +84,15 @@ def read_recorded(
 
     Raises:
         RunError: no folder is given, one does not exist, or none holds episodes of the engines; or the episodes have
-            two robots or rates.
+            two robots or rates; or the task has another placeholder.
         FileFormatError: a file is damaged, or older than recorded actions.
     """
     if not folders:
         raise RunError(
             "Nothing to export. Give a run folder, or a folder that xreset eval wrote into."
         )
+    sentence = TASK if task is None else task
+    _check_placeholders(sentence)
     rows = []
     robots: dict[str, RobotSpec] = {}
     intervals: dict[float, Path] = {}
@@ -112,7 +115,7 @@ def read_recorded(
                 intervals.setdefault(_interval(trace), results)
             table = recorded(evaluation.to_frame(), result.engine, traces)
             for episode, action in _sound_episodes(table, file):
-                episode["task"] = (task or TASK).replace("{object}", short_name(episode["object"]))
+                episode["task"] = sentence.replace("{object}", short_name(episode["object"]))
                 episode["action"] = action
                 episode["meshes"] = result.meshes_folder(meshes)
                 rows.append(episode)
@@ -136,6 +139,18 @@ def read_recorded(
         episodes=pd.DataFrame(rows),
         inputs=inputs,
     )
+
+
+def _check_placeholders(task: str) -> None:
+    """Refuse, with ``RunError``, a task in words that is empty or has another placeholder than ``{object}``."""
+    if not task.strip():
+        raise RunError("The task is empty. Say in words what the episodes show, or omit --task.")
+    unknown = re.search(r"\{[^{}]*\}?|\}", task.replace("{object}", ""))
+    if unknown:
+        raise RunError(
+            f"Unknown placeholder {unknown[0]!r} in the task {shown(task)}. The only placeholder is {{object}}, the "
+            "name of the object."
+        )
 
 
 def _interval(trace: Trace) -> float:

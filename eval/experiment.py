@@ -92,8 +92,13 @@ def _play_in(
     progress: Progress,
 ) -> tuple[EvalResult, tuple[Trace, ...]]:
     """Return the result in one engine, and the recorded episodes; arguments as for :func:`play`."""
-    played = [each for each in conditions if _can_set(engine, each)]
-    skipped = [each.property for each in conditions if not _can_set(engine, each)]
+    played = []
+    skipped = []
+    for condition in conditions:
+        if _can_set(engine, condition):
+            played.append(condition)
+        else:
+            skipped.append(condition.property)
     tables = []
     stopped: Counter[str] = Counter()
     traces: tuple[Trace, ...] = ()

@@ -79,6 +79,10 @@ class FileTest(Studied):
                 r"tables\[0\]\.paper is 'X', expected one of 'I'",
             ),
             (
+                "[[tables]]\nmetric = 'overflow'\nruns = {}",
+                r"metric is 'overflow', expected one of 'task_progress'",
+            ),
+            (
                 f"{a}[[tables]]\npaper = 'I'\nruns = {{ a = 'A' }}",
                 r"runs is 'A', expected one of 'IK Oracle'",
             ),
@@ -354,6 +358,21 @@ class TablesTest(Studied):
         lines = (self.folder / "page" / "results.csv").read_text().splitlines()
         (soup,) = [x for x in lines if x.startswith(f"ours-seed1,mujoco,{SOUP},task_progress,")]
         self.assertEqual(float(soup.split(",")[4]), 0.66)
+
+    def test_the_unit_is_that_of_the_metric(self):
+        self.write("ours-seed0", 1.0, 1.0, 0.33, 0.33)
+        lengths = "[[tables]]\nmetric = 'least_distance'\nrows = 'run'\nruns = { ours = 'A' }\n"
+        every = "[[tables]]\nmetric = 'least_distance'\nrows = 'metric'\nruns = { ours = 'A' }\n"
+        plan = self.plan(self.TEXT + lengths + every)
+        tables = [fill(plan, spec) for spec in plan.study.tables]
+        self.assertEqual([table.unit for table in tables], ["%", "%", "cm", "%"])
+        heads = [table.engines["mujoco"][0][0] for table in tables]
+        self.assertEqual(heads, ["%", "%", "cm", "%"])
+        names = [row[0] for row in tables[3].engines["mujoco"]]
+        self.assertIn("published success", names)
+        self.assertIn("published distance [cm]", names)
+        notes = [each.note.split(",")[0] for each in write_page(plan, self.folder / "page").tables]
+        self.assertEqual(notes, ["Percent", "Percent", "Centimetres", "Percent"])
 
     def test_a_mean_over_some_objects_is_not_shown_as_one_over_all(self):
         self.write("ours-tomato_soup_can-seed0", 1.0, 0.33)

@@ -250,11 +250,12 @@ def _check_names(study: Study) -> None:
     from xreset.eval.metrics import METRICS  # imports torch
 
     papers = paper_tables()
+    metrics = [name for name, metric in METRICS.items() if metric.unit != "episodes"]
     for i, table in enumerate(study.tables):
         where = f"tables[{i}]"
         _expect(f"{where}.paper", papers, table.paper)
         _expect(f"{where}.evaluation", study.evaluations, table.evaluation)
-        _expect(f"{where}.metric", METRICS, table.metric)
+        _expect(f"{where}.metric", metrics, table.metric)
         _expect(f"{where}.runs", study.runs, *table.runs)
         if table.paper:
             methods = dict.fromkeys(method for method, _, _ in papers[table.paper].figures())

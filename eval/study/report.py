@@ -34,7 +34,7 @@ def write_page(plan: Plan, out: Path) -> Report:
         notes += [f"{table.title}: {note}" for note in _unfair(plan, spec, table)]
         for engine, rows in table.engines.items():
             played = versions(chain(*table.trainings.values()), engine)
-            note = f"{_note(spec, rows[0][0])} {table.counts(engine)}"
+            note = f"{_note(spec, table.unit)} {table.counts(engine)}"
             title = f"{table.title}: {engine} {played}"
             page_tables.append(PageTable(title=title, rows=rows, note=note))
     report = collect(

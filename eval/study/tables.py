@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import chain
+from typing import Literal
 
 import pandas as pd
 
@@ -26,8 +27,10 @@ class FilledTable:
     """A table of the study with its figures."""
 
     title: str
+    unit: Literal["%", "cm", "episodes"]
+    """Unit of the figures whose row or column states no other."""
     engines: dict[str, Rows]
-    """Engine -> rows of text; ``-`` where a run was not evaluated. The first cell is the unit of the figures."""
+    """Engine -> rows of text; ``-`` where a run was not evaluated."""
     trainings: dict[str, list[Training]]
     """Run of the study -> its evaluated trainings."""
     episodes: dict[str, Table]
@@ -73,7 +76,8 @@ def fill(plan: Plan, table: TableSpec) -> FilledTable:
         return estimate_text(key["metric"], *values) + stated.get(theirs, "")
 
     engines = {}
-    unit = METRICS[fixed["metric"]].unit
+    has_metrics = "metric" in (layout.rows, layout.columns)
+    unit = "%" if has_metrics else METRICS[layout.metric].unit
     for engine in sorted(set().union(*(t.results for t in chain(*trainings.values())))):
         lines = [(unit, *(_shown(layout.columns, column) for column in columns))]
         for row in rows:
@@ -83,6 +87,7 @@ def fill(plan: Plan, table: TableSpec) -> FilledTable:
             engines[engine] = lines
     return FilledTable(
         title=table.title or layout.title,
+        unit=unit,
         engines=engines,
         trainings=trainings,
         episodes=episodes,
@@ -151,4 +156,7 @@ def _episodes_with(episodes: Table, engine: str, objects: set[str]) -> Table:
 def _shown(axis: str, name: str) -> str:
     if axis == "object":
         return "all of them" if name == ALL else short_name(name)
-    return METRICS[name].title if axis == "metric" else name
+    if axis == "metric":
+        metric = METRICS[name]
+        return metric.title if metric.unit == "%" else f"{metric.title} [{metric.unit}]"
+    return name

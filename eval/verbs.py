@@ -206,7 +206,6 @@ def make_report(
     meshes: str | Path | None = None,
     x: X | None = None,
     curves: Annotated[Sequence[str], Option("curve")] = (),
-    apart: bool = False,
     film: Mp4 | None = None,
     progress: Callable[[str, float, int], None] = unseen,
 ) -> Report:
@@ -225,7 +224,6 @@ def make_report(
         x: horizontal axis of the learning curves; default: minutes as measured, or iterations if they are not known.
         curves: learning curve to draw, as TensorBoard names it (task/grasped_from_home, episode/length, ...), or
             several; default: success, success from home, grasps and return.
-        apart: show runs that differ only in their seed separately.
         film: MP4 to write as well: every object in every run and engine, next to each other.
         progress: called with the name of what is drawn.
 
@@ -247,7 +245,7 @@ def make_report(
         out = trainings[0].folder / "report" if len(trainings) == 1 else "runs/report"
     films = {"robot": str(robot) if robot else None, "meshes": Path(meshes) if meshes else None}
     with claim_folder(Path(out)):
-        found = make.collect(trainings, x=x, curves=curves, apart=apart)
+        found = make.collect(trainings, x=x, curves=curves)
         progress("drawing films", 0, 0)
         found = make.write_report(found, Path(out), **films)
     if film is not None:

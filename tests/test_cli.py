@@ -184,6 +184,10 @@ class UsageTest(TestCase):
 
     def test_flags_and_commands_that_are_gone_say_what_is_done_now(self):
         for words, told in (
+            (
+                "report a b --apart",
+                "--apart is gone: runs that differ only in their seed share a row",
+            ),
             ("eval zero --demos none --settle", "--settle is gone: episodes begin as recorded"),
             ("resets none --out b.npz --squeeze.weight 0", "press with --squeeze.force and the"),
             ("resets none --out b.npz --squeeze.reach=0.1", "--squeeze.reach is gone: fingers"),

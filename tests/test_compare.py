@@ -549,8 +549,6 @@ class WrittenTest(Compared):
             self.assertRegex(text, row)
         self.assertNotIn("num_envs", text, "the same in all")
         self.assertIn("x is 2 trainings that differ in the seed only (x-s0, x-s1)", text)
-        self.compare(*names, apart=True)
-        self.assertEqual(self.report.title, "x-s0, x-s1, fixed, ik")
 
     def test_curves(self):
         names = self.write_three()

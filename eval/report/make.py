@@ -28,7 +28,6 @@ from xreset.eval.report.groups import (
     differences,
     grouped,
     scores,
-    singles,
 )
 from xreset.eval.report.read import Training
 from xreset.eval.stats import Table
@@ -83,7 +82,6 @@ def collect(
     *,
     x: X | None = None,
     curves: Sequence[str] = (),
-    apart: bool = False,
     title: str = "",
     notes: Sequence[str] | None = None,
     page_tables: Sequence[PageTable] = (),
@@ -94,12 +92,11 @@ def collect(
         trainings: the runs.
         x: as of :func:`~xreset.eval.verbs.make_report`, and so are the next two.
         curves: names of curves.
-        apart: whether seeds are shown separately.
         title: title of the page; default: the policy, or the runs.
         notes: sentences about what is unfair; None: they are found here.
         page_tables: tables to show first.
     """
-    groups, reasons = (singles(trainings), []) if apart else grouped(trainings)
+    groups, reasons = grouped(trainings)
     found = scores(groups)
     if notes is None:
         notes = [*reasons, *fairness.doubts(trainings, groups)]

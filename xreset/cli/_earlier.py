@@ -36,6 +36,7 @@ _GONE = {
     "select": "evaluate checkpoints, xreset eval RUN/checkpoints/NUMBER.pt, and compare them with xreset report",
     "engines attribute": "xreset engines check measures engines, xreset stress what a policy tolerates",
     "engines trace": "xreset engines compare plays grasps in several engines, xreset report films policies in them",
+    "--apart": "runs that differ only in their seed share a row; xreset report RUN shows one of them",
     "--settle": "episodes begin as recorded, because starts at rest gained nothing",
     "--squeeze.weight": _SQUEEZE,
     "--squeeze.balanced": _SQUEEZE,

@@ -77,14 +77,14 @@ def run(
 
     demos = Path(demos)
     out = Path(out)
+    # what the last steps would refuse, after minutes of work; engines last, because they take seconds to load
     archive = read_demos(demos)
     spec = load_robot(robot)
-    named = [engine] if isinstance(engine, str) else engine
-    engines = [each.name for each in quick_engines(named, "cpu")]
-    # what the last steps would refuse, after minutes of work
-    backend_class(ENGINE).engine_version()
     task = starting_config(recipe).task
     shared_worlds(archive.object_names, num_envs, task.reset.object_share)
+    named = [engine] if isinstance(engine, str) else engine
+    engines = [each.name for each in quick_engines(named, "cpu")]
+    backend_class(ENGINE).engine_version()
     if minutes is None and iterations is None:
         minutes = _MINUTES
     _show_times(len(archive.sequence_name), archive.num_frames, minutes, episodes, engines)

@@ -651,6 +651,19 @@ class TrainingTest(WithBank):
             read_policy(out).content, first, "the choice did not know the newest one"
         )
 
+    def test_too_few_worlds_are_refused_before_objects_are_loaded(self):
+        goals = self.folder / "goals.npz"
+        write_goals(goals, toy_goals(self.robot))
+        for data in ({}, {"goals": goals}, {"bank": None, "goals": goals}, {"bank": self.states}):
+            with (
+                self.subTest(data=data),
+                patch("xreset.resets.inputs.load_objects") as loaded,
+                self.assertRaisesRegex(XResetError, r"1 worlds cannot hold \d objects"),
+            ):
+                self.train("few", num_envs=1, **data)
+            self.assertFalse(loaded.called, "cutting meshes takes minutes")
+        self.assertFalse((self.folder / "few").exists())
+
     def test_what_cannot_be_trained_is_refused_and_leaves_no_run(self):
         cloud = {"cloud": {"frames": 3, "noise": 0.002, "scale": 1.0}}
         observation = replace(CONFIG.task.observation, perception=cloud)

@@ -48,7 +48,6 @@ from xreset.policy.shipped import shipped_name
 from xreset.resets.bank import ResetBank, read_bank, write_bank
 from xreset.resets.goals import GoalSet, read_goals, with_goals, write_goals
 from xreset.resets.inputs import Inputs, load_inputs
-from xreset.resets.schedule import shared_worlds
 from xreset.spec import RobotSpec
 from xreset.task.rewards import RewardFunction
 
@@ -228,16 +227,15 @@ def bank_or_goals(
     return given
 
 
-def check_config(config: TrainConfig, inputs: Inputs, *, num_envs: int, has_teacher: bool) -> None:
+def check_config(config: TrainConfig, inputs: Inputs, *, has_teacher: bool) -> None:
     """Refuse, with ``XResetError``, a schedule without effect, bank states where there are none, unknown terms of the
-    reward, an object without a world, and a student without cameras."""
+    reward, and a student without cameras."""
     if has_teacher and not config.task.vision.cameras:
         raise XResetError(
             "A student needs a camera. Give one or two of: " + ", ".join(CAMERAS) + "."
         )
     check_each_once(config.task.vision.cameras)
     RewardFunction(config.task.reward)
-    shared_worlds([o.name for o in inputs.objects], num_envs, config.task.reset.object_share)
     if config.schedule.teacher and not has_teacher:
         raise RunError(
             "schedule.teacher is for students (--teacher), and this training has no teacher. Leave it empty: "

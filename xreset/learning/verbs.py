@@ -103,8 +103,6 @@ def train(
         XResetError: bank, robot, objects and configuration do not fit together; or a camera is unknown, given twice or
             inside a body, or never shows some object.
     """
-    from xreset.learning import train as training
-    from xreset.policy.onnx_policy import policy_contract
     from xreset.resets.goals import GoalSet
     from xreset.resets.inputs import load_inputs
 
@@ -115,10 +113,21 @@ def train(
         given = {"robot": robot, "meshes": meshes, "engine": engine, "device": device}
         given |= {"num_envs": num_envs, "seed": seed, "teacher": teacher}
         given |= {"recipe": recipe, "weights": weights, "cameras": cameras or None}
+        from xreset.learning import train as training
+
         training.refuse_options(out, given, config)
         own = config.task.reward.own if config else None
         return training.resume(out, own=own, **length)
     config = _configuration(config, recipe, weights, teacher, cameras, goals)
+    if num_envs is None:
+        num_envs = _WORLDS if teacher is None else _WORLDS_OF_STUDENT
+    # before torch is imported and meshes are cut
+    _check_worlds(first, goals, num_envs // (1 + len(others)), config)
+    for bank in others:
+        _check_worlds(bank, None, num_envs // (1 + len(others)), config)
+    from xreset.learning import train as training
+    from xreset.policy.onnx_policy import policy_contract
+
     present = read_run(out) if checkpoints(out) else None
     engine = engine or ENGINE
     device = _device(device, engine, present)
@@ -132,12 +141,8 @@ def train(
     robots = [each.robot for each in loaded]
     if others:
         config = for_robots(config, _different(robots))
-    if num_envs is None:
-        num_envs = _WORLDS if teacher is None else _WORLDS_OF_STUDENT
     for each in loaded:
-        training.check_config(
-            config, each, num_envs=num_envs // len(loaded), has_teacher=teacher is not None
-        )
+        training.check_config(config, each, has_teacher=teacher is not None)
     version = backend_class(engine).engine_version()  # fails where the engine is missing
     start = None
     if weights is not None:
@@ -193,6 +198,21 @@ def _first_and_others(
     if not all(isinstance(each, str | Path) for each in bank):
         raise RunError("Several reset banks must be files. Write them with xreset.write_bank.")
     return bank[0], bank[1:]
+
+
+def _check_worlds(bank: Any, goals: Any, num_envs: int, config: TrainConfig) -> None:
+    """Refuse, with ``XResetError``, an object of a bank, of a goal set or of both that would get none of the worlds."""
+    from xreset.resets.bank import ResetBank
+    from xreset.resets.inputs import read_data
+    from xreset.resets.schedule import shared_worlds
+
+    names: dict[str, None] = {}
+    for data in (bank, goals):
+        if isinstance(data, str | Path):
+            data = read_data(Path(data), ("bank", "goals"))
+        if isinstance(data, ResetBank):  # a goal set, too
+            names |= dict.fromkeys(data.object_names)
+    shared_worlds(tuple(names), num_envs, config.task.reset.object_share)
 
 
 def _different(robots: Sequence[RobotSpec]) -> Sequence[RobotSpec]:

@@ -141,7 +141,7 @@ def load_inputs(
     data = source
     if isinstance(data, str | Path):
         path = Path(data)
-        data = _read(path, accept)
+        data = read_data(path, accept)
     if not isinstance(data, Data):
         raise XResetError(
             f"Found {shown(data)}, expected Demos, Retargeted, a ResetBank or their file."
@@ -195,7 +195,8 @@ def load_inputs(
     return inputs
 
 
-def _read(path: Path, accept: tuple[Kind, ...]) -> Data:
+def read_data(path: Path, accept: Iterable[Kind]) -> Data:
+    """Read a file of one of the kinds, without its robot and objects; ``FileFormatError`` if it is none."""
     commands = " or ".join(_KINDS[kind][2] for kind in accept)
     stated = npz_schema(path, what=f"a file of {commands}")
     expected = []

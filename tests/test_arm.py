@@ -292,6 +292,9 @@ class WritePlacementTest(InFolder):
         self.assertRegex(said, rows)
         exact = f"{1e3 * placing._POSITION:g} mm and {np.degrees(placing._ORIENTATION):g} degrees"
         self.assertIn(f"sample of their wrist poses, each on its own, to {exact}", said)
+        self.assertIn(
+            "xreset robots judge counts demonstrations that a rigid grasp can follow", said
+        )
         self.assertEqual(load(self.folder).base_pos, self.best.robot.base_pos)
         self.assertIn("--write --search.rounds 1", self.lines(True)[0])
 

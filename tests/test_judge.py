@@ -99,5 +99,6 @@ class Judge(InFolder):
             main(["robots", "judge", f"{self.folder}/bank.npz", *words.split()])
         self.assertRegex(output.getvalue(), r"brick +│ +3 +│ 0, 0, 0")
         self.assertIn("in 3 of 3 states", output.getvalue())
+        self.assertIn("place counts frames in which the arm follows the human", output.getvalue())
         self.assertIn("demonstrations in reach): brick 0%", output.getvalue())
         self.assertEqual(Image.open(self.folder / "judge.png").size[0], 4 * judging._TILE[0])

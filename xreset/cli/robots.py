@@ -86,6 +86,10 @@ def _show_places(found: Sequence[Finalist], options: Mapping[str, Any]) -> None:
         f"follows: share of {found[0].frames} annotated frames of {found[0].sequences} sequences, one after another; "
         "reaches: of a sample of their wrist poses, each on its own, to 5 mm and 5 degrees"
     )
+    console.print(
+        "These are poses of the human's wrist. xreset robots judge counts demonstrations that a rigid grasp can "
+        "follow, with other poses of the hand."
+    )
     if options["write"]:
         console.print(f"wrote {robot_folder(options['robot']) / 'robot.toml'}")
 
@@ -110,6 +114,10 @@ def _show_judged(found: Judgement, options: Mapping[str, Any]) -> None:
         )
     show_table(
         table, title="demonstrations that a rigid grasp can follow, from the start to the goal"
+    )
+    console.print(
+        "The hand's poses follow from the grasp and the object. xreset robots place counts frames in which the arm "
+        "follows the human's wrist, with other poses of the hand."
     )
     if found.without:
         absent = ", ".join(found.without)

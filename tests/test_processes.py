@@ -29,6 +29,18 @@ print(child.exitcode)
 """
 
 
+KILLED = """
+import os, signal, subprocess
+from math import sqrt
+from unittest.mock import patch
+from xreset.files.processes import in_processes
+with patch("joblib.cpu_count", return_value=2):
+    list(in_processes(sqrt, [1.0, 4.0, 9.0]))
+subprocess.run(["pkill", "-KILL", "--parent", str(os.getpid()), "--full", "LokyProcess"])
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
 def process_of(job: int) -> tuple[int, int]:
     return job, os.getpid()
 
@@ -62,6 +74,18 @@ class ProcessesTest(TestCase):
     def test_a_killed_process_is_said(self):
         with self.assertRaisesRegex(XResetError, "was killed.*LOKY_MAX_CPU_COUNT=1"):
             list(in_processes(die, range(3)))
+
+    def test_a_killed_command_prints_nothing_later(self):
+        run = subprocess.run([sys.executable, "-c", KILLED], capture_output=True, text=True)
+        # the output ends when the last of its processes ends
+        self.assertEqual((run.returncode, run.stderr), (-signal.SIGKILL, ""))
+
+    def test_the_variables_of_a_command_stay_as_they_are(self):
+        for given in ({}, {"PYTHONWARNINGS": "default"}):
+            with patch.dict(os.environ, given):
+                before = dict(os.environ)
+                list(in_processes(process_of, range(3)))
+                self.assertEqual(dict(os.environ), before)
 
     def test_a_script_needs_no_main_guard(self):
         script = Path(self.enterContext(TemporaryDirectory())) / "script.py"

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from typing import TypeVar, cast
 
 import numpy as np
@@ -13,6 +15,9 @@ from xreset.errors import XResetError
 _IDLE = 10.0
 """[s] after which a process without work ends: five minutes by default, for which a child of multiprocessing would wait
 at its own end."""
+_QUIET = "ignore:resource_tracker:UserWarning"
+"""Warning of joblib's resource tracker after a kill: it comes when the command has ended, and names what the
+tracker then removes."""
 _Job = TypeVar("_Job")
 _Result = TypeVar("_Result")
 
@@ -50,7 +55,8 @@ def in_processes(function: Callable[[_Job], _Result], jobs: Sequence[_Job]) -> I
         return
     with joblib.parallel_config(backend="loky", inner_max_num_threads=1, idle_worker_timeout=_IDLE):
         pool = joblib.Parallel(n_jobs=count, return_as="generator")
-        results = pool(joblib.delayed(function)(job) for job in jobs)
+        with _quiet_tracker():
+            results = pool(joblib.delayed(function)(job) for job in jobs)
         try:
             yield from cast("Iterator[_Result]", results)
         except BrokenProcessPool as error:
@@ -58,3 +64,17 @@ def in_processes(function: Callable[[_Job], _Result], jobs: Sequence[_Job]) -> I
                 "A process of this command was killed, perhaps because the memory is full. Close other programs, or "
                 "use fewer processes (LOKY_MAX_CPU_COUNT=1), and repeat the command."
             ) from error
+
+
+@contextmanager
+def _quiet_tracker() -> Iterator[None]:
+    """Let the resource tracker, a process that starts with the first jobs, print no warnings after a kill."""
+    earlier = os.environ.get("PYTHONWARNINGS")
+    os.environ["PYTHONWARNINGS"] = f"{earlier},{_QUIET}" if earlier else _QUIET
+    try:
+        yield
+    finally:
+        if earlier is None:
+            del os.environ["PYTHONWARNINGS"]
+        else:
+            os.environ["PYTHONWARNINGS"] = earlier

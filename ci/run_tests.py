@@ -28,8 +28,8 @@ QUICK = (
 """Tests of `--quick`, which need neither physics nor all of the package: modules, classes or methods."""
 
 SLOW = (
-    "conformance_engines", "training", "import_robot", "play_browser", "learns", "parity", "distributed",
-    "shipped_policy", "objects", "try_page", "examples", "pool", "deploy", "retarget", "fuzz", "report",
+    "conformance_engines", "import_robot", "learns", "training", "shipped_policy", "examples", "play_browser",
+    "try_page", "fuzz", "parity", "cli", "objects", "study", "report", "distributed", "without_torch",
 )  # fmt: skip
 """Modules that begin first, so that none of them is alone at the end."""
 

@@ -366,6 +366,7 @@ class ScoreTest(Compared):
         more = [x[:41] for x in (both[0], runs, demos)]
         self.assertRaisesRegex(ValueError, "every training needs", difference_ci95, few, more)
 
+    @mock.patch("xreset.eval.stats.DRAWS", 600)
     def test_chance_among_many_comparisons_is_not_claimed(self):
         self.assertEqual(holm([0.01, 0.04, 0.03]), [True, False, False])
         self.assertEqual(holm([0.04, 0.001, 0.02]), [True, True, True])

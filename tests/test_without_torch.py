@@ -64,13 +64,6 @@ class WithoutTorchTest(InFolder):
         self.assertLess(distance, 0.03)
         self.assertTrue((self.folder / "play.mp4").stat().st_size)
 
-    def test_policies_that_ship_are_exported(self):
-        names = shipped_graphs()
-        export = "export deploy {0} --out on_robot/{0} --object soup".format
-        self.run_commands(*map(export, names))
-        for name in names:
-            self.assertTrue((self.folder / "on_robot" / name / "policy.onnx").exists(), name)
-
     def test_policies_are_listed_and_one_with_cameras_is_refused(self):
         found = self.run_blocked(
             "from xreset.cli import main\n"
@@ -86,12 +79,16 @@ class WithoutTorchTest(InFolder):
         )
         self.assertIn("many-objects-camera: ", found)
 
-    def test_demonstrations_and_results_are_shown(self):
+    def test_policies_are_exported_and_demonstrations_and_results_shown(self):
         write_result(self.folder / "run" / "eval", toy_result(), [], ("a",))
+        names = shipped_graphs()
         found = self.run_commands(
+            *map("export deploy {0} --out on_robot/{0} --object soup".format, names),
             "demos synth --objects soup --per-object 1 --out demos.npz",
             "view demos.npz --png demos.png",
             "report run --out page",
         )
+        for name in names:
+            self.assertTrue((self.folder / "on_robot" / name / "policy.onnx").exists(), name)
         self.assertIn("page: page", found)
         self.assertTrue((self.folder / "page" / "index.html").exists())

@@ -20,14 +20,14 @@ def main(folder: Path, recording: Path, episode: int = 0) -> None:
         def __init__(self) -> None:
             with np.load(recording) as file:
                 rows = slice(*file["frame_offsets"][episode : episode + 2])
-                self.frames = {
-                    name: file[name][rows]
-                    for name in file.files
-                    if name.startswith(("time", "joint_p", "joint_t", "object_p", "object_q"))
-                }
+                joints = controller.rows(file["joint_names"])
+                self.times = file["time"][rows]
+                self.joint_pos = file["joint_pos"][rows][:, joints]
+                self.targets = file["joint_target"][rows][:, joints]
+                self.poses = file["object_pos"][rows], file["object_quat_wxyz"][rows]
                 self.goal = file["goal_pos"][episode], file["goal_quat_wxyz"][episode]
-                self.object_name = str(file["object_name"][episode])
-            self.joint_vel = np.gradient(self.frames["joint_pos"], self.frames["time"], axis=0)
+                self.object = str(file["object_name"][episode])
+            self.joint_vel = np.gradient(self.joint_pos, self.times, axis=0)
             self.clock = 0.0
             self.errors = []
 
@@ -35,32 +35,32 @@ def main(folder: Path, recording: Path, episode: int = 0) -> None:
             return self.clock
 
         def wait_until(self, moment):
+            k = self.frame(self.clock)
+            if self.frame(moment) > k:  # the recorded target is the last one before the next frame
+                self.errors.append(np.abs(controller.target - self.targets[k]).mean())
+                controller.target = self.targets[[k]]  # else differences add up
             self.clock = moment
 
-        def read(self):
-            self.row = np.searchsorted(self.frames["time"], self.clock + 1e-6) - 1
-            return runtime.Reading(
-                joint_pos=self.frames["joint_pos"][self.row],
-                joint_vel=self.joint_vel[self.row],
-                joint_time=self.frames["time"][self.row],
-                object_pos=self.frames["object_pos"][self.row],
-                object_quat=self.frames["object_quat_wxyz"][self.row],
-                object_time=self.frames["time"][self.row],
-            )
+        def frame(self, moment):
+            return np.searchsorted(self.times, moment + 1e-6) - 1
 
-        def send(self, target):
-            self.errors.append(np.abs(target - self.frames["joint_target"][self.row]).mean())
+        def read(self):
+            k = self.frame(self.clock)
+            return runtime.Reading(
+                joint_pos=self.joint_pos[k], joint_vel=self.joint_vel[k], joint_time=self.times[k],
+                object_pos=self.poses[0][k], object_quat=self.poses[1][k], object_time=self.times[k],
+            )  # fmt: skip
+
+        def send(self, target): ...
 
         def stop(self):
             print("the robot holds still")
 
-    robot = ReplayedRobot()
     controller = runtime.load_controller(folder)
-    name = robot.object_name
-    controller.begin(
-        controller.points(name), *robot.goal, robot.frames["joint_pos"][0], controller.center(name)
-    )
-    outcome = runtime.Runner(controller, robot).run(float(robot.frames["time"][-1]))
+    robot = ReplayedRobot()
+    points = controller.points(robot.object)
+    controller.begin(points, *robot.goal, robot.joint_pos[0], controller.center(robot.object))
+    outcome = runtime.Runner(controller, robot).run(float(robot.times[-1]))
     print(f"{outcome.steps} steps; stopped because: {outcome.reason or 'the recording is over'}")
     print(f"targets differ from the recorded ones by {np.mean(robot.errors):.3f} rad")
 

@@ -6,6 +6,7 @@ from functools import partial
 import numpy as np
 import rclpy
 from geometry_msgs.msg import PoseStamped
+from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
@@ -22,7 +23,6 @@ def main(folder: str, object_name: str, seconds: float = float("inf")) -> None:
 
         def __init__(self, node):
             self.node, self.newest = node, {}
-            self.names = [joint["name"] for joint in controller.contract["joints"]]
             for topic, kind in TOPICS.items():
                 node.create_subscription(kind, topic, partial(self.newest.__setitem__, topic), 1)
             self.targets = node.create_publisher(Float64MultiArray, "forward_commands", 1)
@@ -42,7 +42,7 @@ def main(folder: str, object_name: str, seconds: float = float("inf")) -> None:
 
         def read(self):
             joints, (pos, quat) = self.newest["joint_states"], self.pose("object_pose")
-            rows = [joints.name.index(name) for name in self.names]
+            rows = controller.rows(joints.name)
             stamps = [self.newest[topic].header.stamp for topic in TOPICS]
             times = [stamp.sec + stamp.nanosec * 1e-9 for stamp in stamps]
             return runtime.Reading(
@@ -56,7 +56,7 @@ def main(folder: str, object_name: str, seconds: float = float("inf")) -> None:
 
         def stop(self): ...  # the controller of ROS holds the last targets
 
-    rclpy.init()
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)  # Ctrl-C is for the runner
     controller = runtime.load_controller(folder)
     robot = RosRobot(rclpy.create_node("policy"))
     points, center = controller.points(object_name), controller.center(object_name)

@@ -322,15 +322,22 @@ class ToyTest(InFolder):
         self.assertEqual(contract, self.contract)
 
     def test_the_example_of_a_driver(self):
-        rows = 11
-        brick = self.contract["objects"]["brick"]
+        reading = self.begin()
+        targets = np.concatenate([self.controller.step(reading) for _ in range(30)])[2::3]
+        rows = 1 + len(targets)
+        targets = np.concatenate((targets, targets[-1:]))
+        self.assertGreater(np.abs(targets[0] - self.home).mean(), 0.01)
         arrays = {
             "time": np.arange(rows) * 0.05,
+            "joint_names": [joint["name"] for joint in self.contract["joints"]][::-1],
             "frame_offsets": [0, rows],
             "object_name": ["brick"],
         }
-        arrays |= {name: np.tile(self.home, (rows, 1)) for name in ("joint_pos", "joint_target")}
-        arrays |= {"object_pos": np.tile(brick["center"], (rows, 1)), "goal_pos": [[0.5, 0.3, 0.2]]}
+        arrays |= {
+            "joint_pos": np.tile(self.home[::-1], (rows, 1)),
+            "joint_target": targets[:, ::-1],
+        }
+        arrays |= {"object_pos": [[0.5, 0.3, 0.1]] * rows, "goal_pos": [[0.5, 0.3, 0.2]]}
         arrays |= {
             "object_quat_wxyz": np.tile([1, 0, 0, 0], (rows, 1)),
             "goal_quat_wxyz": [[1, 0, 0, 0]],
@@ -339,6 +346,13 @@ class ToyTest(InFolder):
         said = run("11_own_driver", self.out, self.folder / "episodes.npz")
         self.assertIn("30 steps; stopped because: the recording is over", said)
         self.assertIn("the robot holds still", said)
+        self.assertIn("by 0.000 rad", said)
+        arrays["joint_names"][0] = "elbow"
+        np.savez(f"{self.folder}/episodes.npz", **arrays)
+        name = self.contract["joints"][-1]["name"]
+        words = f"robot '{self.robot.name}' with the joint '{name}', but this robot has the joints elbow, "
+        with self.assertRaisesRegex(Exception, words):
+            run("11_own_driver", self.out, self.folder / "episodes.npz")
 
     def readings(self, steps):
         """Return numbers [steps, ...] for every input of the graph but the memory, by name."""
@@ -365,7 +379,7 @@ class ToyTest(InFolder):
         command = ["g++", "-std=c++17", "-Wall", "-Werror", "-I", stand_in, "-o", program]
         command += [EXAMPLES / "deploy_cpp" / "policy.cpp", linked, f"-Wl,-rpath,{self.folder}"]
         subprocess.run(command, check=True)
-        steps = 4
+        steps = 100
         readings = self.readings(steps)
         lines = []
         for k in range(steps):
@@ -419,6 +433,9 @@ class ToyTest(InFolder):
     def test_the_ros_2_node(self):
         with ros(self.contract, self.home) as published:
             importlib.import_module("12_ros2_node").main(str(self.out), "brick", 0.5)
+            rclpy = sys.modules["rclpy"]
+            handler = sys.modules["rclpy.signals"].SignalHandlerOptions.NO
+        rclpy.init.assert_called_once_with(signal_handler_options=handler)
         self.assertEqual(len(published), 30)
         self.assertEqual(np.shape(published), (30, 5))
         joints = self.controller.contract["joints"]
@@ -553,6 +570,7 @@ def ros(contract, home, vanishing=None):
     node.get_clock.return_value.now = lambda: SimpleNamespace(nanoseconds=clock.time * 1e9)
     modules = {
         "rclpy": mock.Mock(spin_once=spin_once, create_node=lambda name: node),
+        "rclpy.signals": mock.Mock(),
         "geometry_msgs": mock.Mock(),
         "geometry_msgs.msg": mock.Mock(PoseStamped="PoseStamped"),
         "sensor_msgs": mock.Mock(),

@@ -5,6 +5,7 @@ Shape letters: N robots that act in step (one, except in rehearsals), J joints, 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -237,6 +238,22 @@ class Controller:
             largest = 0.0 if values is None else np.abs(values).max(initial=0.0)
             if not largest <= most:
                 raise LiveError(f"{name} holds {largest:g}, expected at most {most:g} {unit}.")
+
+    def rows(self, names: Sequence[str]) -> list[int]:
+        """[J] place of each joint of the contract in a robot's own list of names.
+
+        Raises:
+            LiveError: the robot lacks a joint of the contract.
+        """
+        listed = list(names)
+        wanted = [joint["name"] for joint in self.contract["joints"]]
+        missing = [name for name in wanted if name not in listed]
+        if missing:
+            raise LiveError(
+                f"The policy is for the robot {self.contract['robot']!r} with the joint {missing[0]!r}, but this robot "
+                f"has the joints {', '.join(listed)}. Use a policy of this robot."
+            )
+        return [listed.index(name) for name in wanted]
 
     def points(self, name: str) -> Array:
         """[P, 3] points of an object, in its frame; ``LiveError`` if the contract has no such object."""

@@ -190,6 +190,37 @@ class FaultTest(TestCase):
         assert_array_equal(moves[-150:], 0)
         self.assertGreater(driver.time, 5.2)
 
+    def test_old_data_at_the_start_move_nothing(self):
+        for name, words in (
+            ("object_time", "pose of the object"),
+            ("joint_time", "joint positions"),
+        ):
+            driver = Scripted(lambda time, reading, name=name: replace(reading, **{name: -5.0}))
+            with self.subTest(name), self.assertLogs("xreset"):
+                outcome = Runner(Steady(), driver).run(30)
+                self.assertIn(words, outcome.reason or "")
+                self.assertEqual(outcome.steps, 0)
+                assert_array_equal(driver.sent, 0)
+
+        def late(time, reading):
+            return reading if time > 2.5 else replace(reading, object_time=-5.0)
+
+        driver = Scripted(late)
+        runner = Runner(Steady(), driver)
+        driver.time = 2.0  # the operator took two seconds
+        self.assertIsNone(runner.run(1).reason)
+        self.assertEqual(runner.outcome.steps, 25)
+
+    def test_limits_that_are_no_limits(self):
+        for name, value in (("pose_age", float("nan")), ("slow_down", -1.0)):
+            with self.assertRaisesRegex(LiveError, f"{name} is {value}, expected 0 or more"):
+                Limits(**{name: value})
+        driver = Scripted(after(1, object_time=0.99))
+        with self.assertLogs("xreset"):
+            Runner(Steady(), driver, Limits(slow_down=0.0, hold=0.1)).run(30)
+        self.assertTrue(np.isfinite(driver.sent).all())
+        assert_array_equal(np.diff(driver.sent[-4:], axis=0), 0)
+
     def test_a_policy_that_fails(self):
         calls = []
 
@@ -249,15 +280,21 @@ class FaultTest(TestCase):
             return reading
 
         driver.fault = moved
-        driver.wait_until = lambda moment: None  # type: ignore[method-assign]
         self.assertIsNone(Runner(Steady(), driver).run(3).reason)
+        self.assertEqual(len(driver.sent), 150)
+        driver.wait_until = lambda moment: None  # type: ignore[method-assign]
+        with self.assertLogs("xreset"):
+            outcome = Runner(Steady(), driver).run(3)
+        self.assertRegex(
+            outcome.reason or "", "waits 0.1. s too little, so the policy runs too fast"
+        )
 
     def test_a_clock_that_nobody_moves(self):
         driver = Scripted()
         driver.wait_until = lambda moment: None  # type: ignore[method-assign]
         with self.assertLogs("xreset"):
             outcome = Runner(Steady(), driver).run(30)
-        self.assertRegex(outcome.reason or "", "clock stands still. Override now.. and wait_until")
+        self.assertRegex(outcome.reason or "", "too fast. Override now.. and wait_until")
         self.assertEqual(driver.stops, 1)
         self.assertLess(len(driver.sent), 10)
 

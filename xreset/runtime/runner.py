@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
@@ -26,8 +26,8 @@ class Limits:
             they are slowed down, and the policy continues from the slower ones.
         workspace: lowest and highest corner [m] of the box that palm and fingertips must not leave, world frame; None:
             no box.
-        late: how late a control step may end, and how long the clock may stand still [s].
-        slow_down: time in which targets come to rest [s].
+        late: how late a control step may end [s].
+        slow_down: time in which targets come to rest [s]; 0: at once.
         hold: time for which resting targets are still sent before the driver's ``stop`` is called [s], for robots that
             fall back to their own watchdog without new targets.
     """
@@ -43,6 +43,10 @@ class Limits:
     hold: float = 0.0
 
     def __post_init__(self) -> None:
+        for entry in fields(self):
+            value = getattr(self, entry.name)
+            if entry.name != "workspace" and not value >= 0:
+                raise LiveError(f"{entry.name} is {value}, expected 0 or more.")
         if self.workspace is not None and not np.less(*self.workspace).all():
             raise LiveError(
                 f"workspace is {self.workspace}, expected the lowest and the highest corner of a box [m]."
@@ -73,14 +77,15 @@ class Outcome:
 
 _NO_NEWER = "no newer one has come"
 _CLOCKS_DIFFER = 0.1
-"""How far a time stamp may be ahead of the driver's clock [s]."""
+"""How far a time stamp, or the next control step, may be ahead of the driver's clock [s]."""
 
 
 class Runner:
     """Keeps a policy's rate on a driver, and stops softly when it cannot go on.
 
-    A pose that is late is used until it is ``pose_age`` old. Data that are not finite, older than the last ones, or
-    ahead of the driver's clock are ignored. After a fault the targets slow down within ``slow_down``, and then stay.
+    A pose that is late is used until it is ``pose_age`` old; until the first usable data, the targets stay. Data that
+    are not finite, older than the last ones, or ahead of the driver's clock are ignored. After a fault the targets slow
+    down within ``slow_down``, and then stay.
     """
 
     def __init__(
@@ -116,12 +121,13 @@ class Runner:
         """[N] why no newer pose is used."""
         self._sent = controller.target
         self._move = np.zeros_like(self._sent)
-        self._begun = driver.now()
+        self._begun = -np.inf
 
     def run(self, seconds: float = float("inf")) -> Outcome:
         """Run until the time is over, until every robot has stopped, or until Ctrl-C; then stop the driver."""
+        self._begun = self.driver.now()
         try:
-            self._loop(self.driver.now() + seconds - self.controller.dt / 2)
+            self._loop(self._begun + seconds - self.controller.dt / 2)
         except KeyboardInterrupt:
             self._interrupted()
         finally:
@@ -140,27 +146,23 @@ class Runner:
     def _loop(self, end: float) -> None:
         """Take control steps until a time [s], or until all robots have stopped and slowed down."""
         due = self.driver.now()
-        last_end = due
-        stalled = 0.0  # time for which the clock has stood still
         rest = self.limits.slow_down + self.limits.hold
         while self.driver.now() < min(end, self._stopped_at.max() + rest):
             if not self._tick():
                 return
             due += self.controller.dt
-            now = self.driver.now()
-            late = now - due
+            late = self.driver.now() - due
             if late > 0:
                 self.outcome.missed += 1
                 due += late  # skipped steps are not made up for
             if late > self.limits.late:
                 self._stop_all(f"A control step took {late:.2f} s too long.")
             self.driver.wait_until(due)
-            step_end = self.driver.now()
-            stalled = 0.0 if step_end > last_end else stalled + (due - now)
-            last_end = step_end
-            if stalled > self.limits.late:
+            early = due - self.driver.now()
+            if early > _CLOCKS_DIFFER:  # further steps would move the robot too fast
                 self._stop_all(
-                    "The driver's clock stands still. Override now() and wait_until() together."
+                    f"The driver waits {early:.2f} s too little, so the policy runs too fast. Override now() and "
+                    "wait_until() together."
                 )
                 return
 
@@ -185,7 +187,9 @@ class Runner:
 
         Joints with absolute targets stay: their targets jump, and ``step_size`` is 0.
         """
-        share = np.clip(1.0 - (now - self._stopped_at) / self.limits.slow_down, 0.0, 1.0)[:, None]
+        slow_down = self.limits.slow_down
+        left = slow_down - np.maximum(now - self._stopped_at, 0.0)
+        share = np.clip(left / max(slow_down, 1e-6), 0.0, 1.0)[:, None]
         step = self.controller.step_size
         slowed = self._sent + (share * np.clip(self._move, -step, step)).astype(np.float32)
         return np.clip(slowed, self.controller.lower, self.controller.upper)
@@ -204,8 +208,9 @@ class Runner:
             return self._sent
         self._check(reading, now)
         running = self._running
-        has_data = np.isfinite(reading.object_time) & np.isfinite(reading.joint_time)
-        if not running.any() or not has_data[running].all():
+        is_new = now - reading.object_time <= self.limits.pose_age
+        is_new &= now - reading.joint_time <= self.limits.joint_age
+        if not running.any() or not is_new[running].all():
             return self._sent
         try:
             target = self.controller.step(reading)

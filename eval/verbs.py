@@ -25,6 +25,7 @@ from xreset.files.checks import (
 )
 from xreset.files.progress import unseen
 from xreset.files.storage import claim_folder
+from xreset.files.text import quantity
 from xreset.physics.plugins import Device
 
 if TYPE_CHECKING:
@@ -319,7 +320,9 @@ def run_study(
         say(f"page: {written.page}")
     if problems:
         raise RunError(
-            "\n".join([f"{len(problems)} steps failed. Finished steps are kept.", *problems])
+            "\n".join(
+                [f"{quantity(len(problems), 'step')} failed. Finished steps are kept.", *problems]
+            )
         )
 
 

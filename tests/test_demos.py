@@ -25,6 +25,7 @@ from xreset.demos.archive import (
 from xreset.demos.dexycb import read_dexycb
 from xreset.demos.grasp import TIPS, Solid
 from xreset.errors import DemoError, FileFormatError, XResetError
+from xreset.files.text import quantity
 from xreset.geometry.shapes import turn_of
 from xreset.objects.catalogue import load_object
 from xreset.objects.rest import rest_height
@@ -498,6 +499,12 @@ class Synthetic(InFolder):
 
 
 class Commands(InFolder):
+    def test_one_sequence_is_not_called_sequences(self):
+        file = self.folder / "one.npz"
+        said = succeeds("demos", "synth", "--objects", "soup", "--per-object", 1, "--out", file)
+        self.assertRegex(said, r"one\.npz: 1 sequence, \d+ frames at")
+        self.assertEqual(quantity(0, "error"), "0 errors")
+
     def test_synth_then_info(self):
         file = self.folder / "demos.npz"
         options = "--objects soup --per-object 1 --side both --fps 10"

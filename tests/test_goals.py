@@ -97,7 +97,7 @@ class MadeTest(InOneFolder):
         file = self.folder / "goals.npz"
         options = ("--family", "yaw", "--draw.per-family", 2, "--draw.seed", 3, "--pose", *pose)
         said = succeeds("goals", "banana", "--robot", "ur7e-sharpa", "--out", file, *options)
-        self.assertIn("3 goals of 1 objects (2 yaw, 1 own)", said)
+        self.assertIn("3 goals of 1 object (2 yaw, 1 own)", said)
         config = GoalConfig(per_family=2, seed=3)
         expected = make_goals(
             ["banana"], robot=self.robot, families=["yaw"], poses=[pose], config=config

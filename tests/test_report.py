@@ -193,7 +193,7 @@ class CollectTest(Reported):
         self.assertEqual(self.collect().notes, ())
         self.write_teacher()
         [note] = self.collect().notes
-        words = "Of 1 episodes that the teacher ends at the goal, the student misses 0."
+        words = "Of 1 episode that the teacher ends at the goal, the student misses 0."
         self.assertEqual(note, words)
         self.write_soup()
         self.assertIsNone(self.read()[0].vision, "the run's configuration has no camera")

@@ -64,7 +64,7 @@ class Run(InFolder, TestCase):
         write_demos(demos, synthesize(["soup", "spam"], 1, fps=5))
         with patch.object(command, "quick_engines") as loaded:
             said = refused("run", demos, "--robot", "openarm", "--num-envs", 1, "--out", out)
-        self.assertIn("1 worlds cannot hold 2 objects", said)
+        self.assertIn("1 world cannot hold 2 objects", said)
         self.assertFalse(loaded.called or out.exists(), "engines take seconds to load")
         said = refused("run", demos, "--robot", "openarm", "--out", demos / "run")
         self.assertIn("cannot make the folder", said)

@@ -658,7 +658,7 @@ class TrainingTest(WithBank):
             with (
                 self.subTest(data=data),
                 patch("xreset.resets.inputs.load_objects") as loaded,
-                self.assertRaisesRegex(XResetError, r"1 worlds cannot hold \d objects"),
+                self.assertRaisesRegex(XResetError, r"1 world cannot hold \d objects"),
             ):
                 self.train("few", num_envs=1, **data)
             self.assertFalse(loaded.called, "cutting meshes takes minutes")

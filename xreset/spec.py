@@ -26,7 +26,7 @@ from xreset.files.checks import (
     Text,
     frozen,
 )
-from xreset.files.text import Brief, shown
+from xreset.files.text import Brief, quantity, shown
 
 GRAVITY = 9.81
 """Magnitude of gravity in m/s^2; it points along -z."""
@@ -373,7 +373,7 @@ def check_robot(path: str | Path, what: str, data: Any, robot: RobotSpec) -> Non
     """
     if data.robot != robot.name or data.joint_names != robot.joint_names:
         raise FileFormatError(
-            f"{path} is a {what} for the robot {data.robot!r} with {len(data.joint_names)} joints; "
+            f"{path} is a {what} for the robot {data.robot!r} with {quantity(len(data.joint_names), 'joint')}; "
             f"{robot.name!r} has {len(robot.joints)}. Make it again for {robot.name!r}, or use the robot "
             f"{data.robot!r}."
         )

@@ -12,7 +12,7 @@ from xreset.eval.metrics import GOAL_DISTANCE
 from xreset.eval.report.read import Training, by_engine, how_to_evaluate
 from xreset.eval.results import read_evaluation
 from xreset.eval.stats import Table
-from xreset.files.text import short_name
+from xreset.files.text import quantity, short_name
 from xreset.learning.run import TEACHER
 
 _CONDITIONS = ("objects", "object meshes", "number of episodes", "seed of the evaluation")
@@ -183,7 +183,7 @@ def missed_by_student(student: Table, teacher: Table) -> str:
     if not len(solved):
         return f"The teacher ends none of {len(both)} episodes at the goal." if len(both) else ""
     missed = solved[~solved["reorient"]]
-    text = f"Of {len(solved)} episodes that the teacher ends at the goal, the student misses {len(missed)}"
+    text = f"Of {quantity(len(solved), 'episode')} that the teacher ends at the goal, the student misses {len(missed)}"
     if not len(missed):
         return f"{text}."
     parts = []

@@ -11,6 +11,7 @@ import numpy as np
 from xreset.cli._terminal import console, show_notes, show_table
 from xreset.cli._verbs import REQUIRED, verb
 from xreset.demos import verbs
+from xreset.files.text import quantity
 
 if TYPE_CHECKING:
     from xreset.demos.archive import Demos
@@ -61,7 +62,8 @@ def _summarize(demos: Demos, what: object, meshes: Path | None = None) -> None:
         caption="right, left: sequences. hand: frames with a hand. lift, goal: medians, from the start",
     )
     console.print(
-        f"{what}: {demos.num_sequences} sequences, {demos.num_frames} frames at {demos.fps:g} per second"
+        f"{what}: {quantity(demos.num_sequences, 'sequence')}, {quantity(demos.num_frames, 'frame')} at "
+        f"{demos.fps:g} per second"
     )
     show_notes(map(str, examine(demos, surfaces_of(demos, meshes))))
 

@@ -11,6 +11,7 @@ from xreset.cli._common import in_all_engines, in_quick_engines
 from xreset.cli._terminal import console, show_table
 from xreset.cli._verbs import verb
 from xreset.eval.engines import verbs
+from xreset.files.text import quantity
 from xreset.physics.plugins import backend_names, backend_status
 
 if TYPE_CHECKING:
@@ -74,7 +75,8 @@ def _print(result: Parity) -> None:
             cells.append(Text.assemble(number, f" (n = {metric.n})"))
         table.append((row.metric, f"{row.sense} {_number(row.target, row.unit)}", *cells))
     grasps = (
-        f"{result.robot}, {len(result.objects)} objects: {len(closings)} closings, {tried} holds"
+        f"{result.robot}, {quantity(len(result.objects), 'object')}: {quantity(len(closings), 'closing')}, "
+        f"{quantity(tried, 'hold')}"
     )
     show_table(table, title=f"{grasps}, of which {reference} carries {sum(closings)} and {held}")
 

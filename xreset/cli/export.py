@@ -10,6 +10,7 @@ from xreset import runtime
 from xreset.cli._terminal import console
 from xreset.cli._verbs import verb
 from xreset.eval import verbs
+from xreset.files.text import quantity
 
 if TYPE_CHECKING:
     from xreset.eval.export.recorded import RecordedEpisodes
@@ -18,8 +19,8 @@ if TYPE_CHECKING:
 def _show_episodes(recording: RecordedEpisodes, options: Mapping[str, Any]) -> None:
     engines = ", ".join(recording.episodes["engine"].unique())
     console.print(
-        f"{options['out']}: {len(recording.episodes)} episodes of {recording.robot.name} in {engines},"
-        f" {recording.offsets[-1]} frames at {recording.fps:g} per second"
+        f"{options['out']}: {quantity(len(recording.episodes), 'episode')} of {recording.robot.name} in {engines}, "
+        f"{quantity(recording.offsets[-1], 'frame')} at {recording.fps:g} per second"
     )
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from xreset.cli._terminal import console
 from xreset.cli._verbs import REQUIRED, verb
+from xreset.files.text import quantity
 from xreset.resets import verbs
 
 if TYPE_CHECKING:
@@ -18,7 +19,8 @@ def _show(goals: GoalSet, options: Mapping[str, Any]) -> None:
     counts = Counter(goals.family.tolist())
     listing = ", ".join(f"{count} {kind}" for kind, count in counts.items())
     console.print(
-        f"{len(goals.family)} goals of {len(goals.object_names)} objects ({listing}) in {options['out']}"
+        f"{quantity(len(goals.family), 'goal')} of {quantity(len(goals.object_names), 'object')} ({listing}) in "
+        f"{options['out']}"
     )
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from xreset.cli._terminal import console, show_table
 from xreset.cli._verbs import verb
+from xreset.files.text import quantity
 from xreset.objects import verbs
 from xreset.pictures import verbs as pictures
 from xreset.spec import ObjectSpec
@@ -61,7 +62,7 @@ def _cells(obj: ObjectSpec) -> tuple[str, ...]:
 
 
 def _show_made(written: Sequence[Path], options: Mapping[str, Any]) -> None:
-    console.print(f"{options['out']}: {len(written)} shapes")
+    console.print(f"{options['out']}: {quantity(len(written), 'shape')}")
 
 
 COMMAND = {

@@ -10,6 +10,7 @@ import numpy as np
 from xreset.cli._common import depth_text, show_accounts
 from xreset.cli._terminal import console
 from xreset.cli._verbs import REQUIRED, verb
+from xreset.files.text import quantity
 from xreset.resets import verbs
 
 if TYPE_CHECKING:
@@ -21,7 +22,7 @@ def _show(bank: ResetBank, options: Mapping[str, Any]) -> None:
     show_accounts(bank.accounts(), title)
     own = int(bank.own_grasp.sum())
     tried = own + len(bank.rejected_reason)
-    kept = f"{own} states of {tried} kept in {options['out']}"
+    kept = f"{quantity(own, 'state')} of {tried} kept in {options['out']}"
     if bank.frame_part is not None:
         between = np.count_nonzero(bank.own_grasp & (bank.frame_part > 0))
         kept += f", {between} of them closing states between frames"
@@ -29,8 +30,8 @@ def _show(bank: ResetBank, options: Mapping[str, Any]) -> None:
     added = bank.sequence_index[~bank.own_grasp]
     if len(added):
         console.print(
-            f"{len(added)} states in grasps of other demonstrations added, to {len(np.unique(added))} of "
-            f"{len(bank.sequence_name)} demonstrations"
+            f"{quantity(len(added), 'state')} in grasps of other demonstrations added, to {len(np.unique(added))} of "
+            f"{quantity(len(bank.sequence_name), 'demonstration')}"
         )
     if bank.num_pressing:
         console.print(

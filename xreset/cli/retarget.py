@@ -10,6 +10,7 @@ import numpy as np
 from xreset.cli._common import depth_text, show_accounts
 from xreset.cli._terminal import console, show_notes
 from xreset.cli._verbs import REQUIRED, verb
+from xreset.files.text import quantity
 from xreset.retarget import verbs
 
 if TYPE_CHECKING:
@@ -40,7 +41,7 @@ def _show(motion: Retargeted, options: Mapping[str, Any]) -> None:
         took = 1e3 * options["seconds"] / motion.annotated.sum()
         console.print(f"{took:.0f} ms a frame, with all preparation")
     console.print(
-        f"{int(motion.valid.sum())} valid frames of {len(motion.valid)} in {options['out']}"
+        f"{quantity(int(motion.valid.sum()), 'valid frame')} of {len(motion.valid)} in {options['out']}"
     )
 
 

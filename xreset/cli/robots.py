@@ -11,6 +11,7 @@ from xreset.cli._common import in_all_engines
 from xreset.cli._terminal import console, show_table
 from xreset.cli._verbs import verb
 from xreset.errors import RobotError
+from xreset.files.text import quantity
 from xreset.physics.plugins import robot_folder, robot_names
 from xreset.retarget.accounts import described
 from xreset.robot_tools import verbs
@@ -54,7 +55,8 @@ def _print_findings(findings: Sequence[Finding]) -> None:
         level = (f"{finding.level:8}", styles[finding.level])
         console.print(Text.assemble(level, f" {finding.topic}: {finding.message}"))
     levels = [finding.level for finding in findings]
-    console.print(f"{levels.count('error')} errors, {levels.count('warning')} warnings")
+    counts = [quantity(levels.count(level), level) for level in ("error", "warning")]
+    console.print(", ".join(counts))
 
 
 def _show_import(made: Imported, _options: Mapping[str, Any]) -> None:
@@ -83,7 +85,8 @@ def _show_places(found: Sequence[Finalist], options: Mapping[str, Any]) -> None:
     best = found[0].robot
     console.print(f"arm at home in the best: {_digits(best.home[best.arm_indices])}")
     console.print(
-        f"follows: share of {found[0].frames} annotated frames of {found[0].sequences} sequences, one after another; "
+        f"follows: share of {quantity(found[0].frames, 'annotated frame')} of "
+        f"{quantity(found[0].sequences, 'sequence')}, one after another; "
         "reaches: of a sample of their wrist poses, each on its own, to 5 mm and 5 degrees"
     )
     console.print(

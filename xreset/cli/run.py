@@ -15,6 +15,7 @@ from xreset.errors import RunError
 from xreset.files.checks import PositiveFloat, PositiveInt, Seed, obeys_rules
 from xreset.files.records import stated_inputs
 from xreset.files.storage import claim_folder, file_hash
+from xreset.files.text import quantity
 from xreset.learning.run import read_run
 from xreset.physics.plugins import Device, backend_class
 
@@ -140,7 +141,8 @@ def _show_times(
     steps["eval"] = played * _EPISODE / 60 / cores
     times = ", ".join(f"{name} {max(value, 0.1):.2g}" for name, value in steps.items())
     console.print(
-        f"{sequences} demonstrations, {frames} frames, {cores} cores; engines: {', '.join(engines)}. "
+        f"{quantity(sequences, 'demonstration')}, {quantity(frames, 'frame')}, {quantity(cores, 'core')}; "
+        f"engines: {', '.join(engines)}. "
         f"About how many minutes each step takes: {times}."
     )
 

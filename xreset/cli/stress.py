@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from xreset.cli._terminal import console, show_table
 from xreset.cli._verbs import verb
 from xreset.eval import verbs
+from xreset.files.text import quantity
 
 if TYPE_CHECKING:
     from xreset.eval import effects
@@ -28,7 +29,8 @@ def _show(found: Evaluation, _options: Mapping[str, Any]) -> None:
         limits = [curve.costs() if curve else "" for curve in curves]
         rows.append(("", "costs ten points", *limits))
     title = f"{found[0].policy}: task progress, and its difference to the same episodes in points (95 %)"
-    show_table(rows, title=f"{title}\n{len(found[0].nominal)} episodes, seed {found[0].seed}")
+    episodes = quantity(len(found[0].nominal), "episode")
+    show_table(rows, title=f"{title}\n{episodes}, seed {found[0].seed}")
     for result in found:
         if result.left_out:
             console.print(

@@ -31,6 +31,11 @@ def listed(names: Sequence[str]) -> str:
     return ", ".join(names) if more < 2 else f"{', '.join(names[:_LISTED])} and {more} more"
 
 
+def quantity(count: int, noun: str) -> str:
+    """Return ``1 frame`` or ``3 frames``, given the noun in the singular."""
+    return f"{count} {noun}{'' if count == 1 else 's'}"
+
+
 class Brief:
     """Base of dataclasses made with ``repr=False``, which print arrays as their shapes, no functions and no bytes, and
     other values shortened."""

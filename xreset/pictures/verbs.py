@@ -16,6 +16,7 @@ from xreset.errors import ObjectError, XResetError
 from xreset.files.checks import Mp4, NonNegativeInt, Output, Png, Port, obeys_rules
 from xreset.files.progress import unseen
 from xreset.files.storage import write_whole
+from xreset.files.text import quantity
 from xreset.objects.properties import Properties
 
 if TYPE_CHECKING:
@@ -95,7 +96,8 @@ def _serve(
     opened = page.Page(shown, host=host, port=port, sequence=sequence, frame=frame)
     number = opened.url.rpartition(":")[2]
     rows = "frames" if shown.is_motion else shown.kind
-    say(f"{len(shown.sequence_name)} sequences, {len(shown.frame)} {rows} at {opened.url}")
+    sequences = quantity(len(shown.sequence_name), "sequence")
+    say(f"{sequences}, {quantity(len(shown.frame), rows.removesuffix('s'))} at {opened.url}")
     tunnel = f"ssh -L {number}:localhost:{number} THIS_MACHINE"
     say(f"From another machine: {tunnel}, then open the same address. Ctrl-C ends.")
     server.serve_until_interrupted(opened)
@@ -126,7 +128,7 @@ def _write_mp4(path: Path, shown: View, rows: np.ndarray, say: Callable[[str], N
     draw = Drawer(shown).draw
     frames = [draw(int(row)) for row in track(rows, "drawing", transient=True)]
     write_whole(path, encode_mp4(np.stack(frames), shown.rate))
-    say(f"{len(rows)} frames in {path}")
+    say(f"{quantity(len(rows), 'frame')} in {path}")
 
 
 @obeys_rules
@@ -212,7 +214,8 @@ def import_objects(
         captions = []
         for result in found:
             deviation = f"at most {1e3 * result.deviation:.1f} mm off the surface"
-            captions.append(f"{result.obj.name}: {len(result.obj.pieces)} pieces, {deviation}")
+            count = quantity(len(result.obj.pieces), "piece")
+            captions.append(f"{result.obj.name}: {count}, {deviation}")
         objects = [result.obj for result in found]
         render.write_png(Path(png), pieces.draw_pieces(objects, captions))
     return found

@@ -8,6 +8,7 @@ import numpy as np
 
 from xreset.errors import XResetError
 from xreset.files.checks import frozen
+from xreset.files.text import quantity
 
 
 @frozen
@@ -72,8 +73,8 @@ def shared_worlds(
     """
     if num_envs < len(names):
         raise XResetError(
-            f"{num_envs} worlds cannot hold {len(names)} objects, so some would never be trained. Take at least "
-            f"{len(names)} worlds (--num-envs), or fewer objects."
+            f"{quantity(num_envs, 'world')} cannot hold {len(names)} objects, so some would never be trained. "
+            f"Take at least {len(names)} worlds (--num-envs), or fewer objects."
         )
     if not share:
         return None
@@ -88,7 +89,7 @@ def shared_worlds(
     worlds[by_remainder[: num_envs - worlds.sum()]] += 1
     if not worlds.all():
         raise XResetError(
-            f"With {num_envs} worlds and this object_share, {names[worlds.argmin()]} gets no world. "
+            f"With {quantity(num_envs, 'world')} and this object_share, {names[worlds.argmin()]} gets no world. "
             "Take more worlds (--num-envs)."
         )
     return np.repeat(np.arange(len(names)), worlds)

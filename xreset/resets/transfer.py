@@ -22,6 +22,7 @@ from xreset.errors import DemoError
 from xreset.files.checks import PositiveInt, frozen, obeys_rules
 from xreset.files.processes import batches
 from xreset.files.progress import unseen
+from xreset.files.text import quantity
 from xreset.geometry.collision import object_depth
 from xreset.geometry.rotations import matrix_to_quat, quat_angle
 from xreset.geometry.shapes import turn_of
@@ -214,13 +215,13 @@ def _grasps(bank: ResetBank, retargeted: Retargeted, robot: RobotSpec) -> np.nda
     :func:`add_transfers`."""
     if not np.array_equal(bank.sequence_name, retargeted.sequence_name):
         raise DemoError(
-            f"The bank has {len(bank.sequence_name)} demonstrations, and they are not the "
+            f"The bank has {quantity(len(bank.sequence_name), 'demonstration')}, and they are not the "
             f"{len(retargeted.sequence_name)} of the motion. Give the motion that the bank was made from."
         )
     if not bank.own_grasp.all():
         raise DemoError(
-            f"The bank already has {(~bank.own_grasp).sum()} states in grasps of other demonstrations. Give the bank "
-            "that xreset.make_bank returned."
+            f"The bank already has {quantity((~bank.own_grasp).sum(), 'state')} in grasps of other demonstrations. "
+            "Give the bank that xreset.make_bank returned."
         )
     start_pos, _ = retargeted.start_pose
     return np.flatnonzero(carried(bank, robot, start_pos[:, 2]))

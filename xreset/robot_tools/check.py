@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from xreset.errors import RobotError, XResetError
+from xreset.files.text import quantity
 from xreset.geometry.collision import SelfCollision, table_clearance
 from xreset.geometry.description import DESCRIPTION, load_robot
 from xreset.geometry.dynamics import damping_ratio, drive_inertia
@@ -64,8 +65,12 @@ def check(name_or_folder: str | Path) -> list[Finding]:
         spec = load_robot(name_or_folder)
     except XResetError as error:
         return [Finding("error", "description", str(error))]
-    joints = f"{len(spec.arm_indices)} arm joints, {len(spec.hand_indices)} hand joints"
-    content = f"{joints}, {len(spec.fingertips)} fingertips"
+    parts = (
+        quantity(len(spec.arm_indices), "arm joint"),
+        quantity(len(spec.hand_indices), "hand joint"),
+        quantity(len(spec.fingertips), "fingertip"),
+    )
+    content = ", ".join(parts)
     found = [Finding("ok", "description", f"{folder / DESCRIPTION}: {content}")]
     try:
         tree = load_urdf(spec.urdf)

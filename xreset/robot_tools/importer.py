@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from xreset.errors import RobotError
 from xreset.files.checks import frozen
 from xreset.files.storage import atomic_folder
-from xreset.files.text import listed
+from xreset.files.text import listed, quantity
 from xreset.geometry.collision import SelfCollision
 from xreset.geometry.description import DESCRIPTION, load_robot
 from xreset.geometry.dynamics import drive_inertia
@@ -160,7 +160,8 @@ def make_robot(
         findings = check(work)
         errors = [finding for finding in findings if finding.level == "error"]
         if errors:
-            more = f" There are {len(errors) - 1} more errors." if len(errors) > 1 else ""
+            others = len(errors) - 1
+            more = f" The check also finds {quantity(others, 'more error')}." if others else ""
             raise RobotError(
                 f"the robot is not written, because it would fail its check: {errors[0].topic}: {errors[0].message}"
                 f"{more}"

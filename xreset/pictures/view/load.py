@@ -13,6 +13,7 @@ from xreset.demos.archive import Demos, ObjectMotions, read_demos, rest_on_table
 from xreset.demos.examine import examine, human_contacts
 from xreset.errors import XResetError
 from xreset.files.records import stated_doubts
+from xreset.files.text import quantity
 from xreset.geometry.surface import prepared_surface
 from xreset.objects.catalogue import canonical_name
 from xreset.pictures.view.data import View
@@ -181,7 +182,7 @@ def _human_of(path: str | Path, demos_path: str | Path, view: View) -> dict[str,
     missing = sorted(set(used) - set(demos.sequence_name.tolist()))
     if missing:
         raise XResetError(
-            f"{demos_path} lacks {len(missing)} sequences of {path}, such as {missing[0]!r}."
+            f"{demos_path} lacks {quantity(len(missing), 'sequence')} of {path}, such as {missing[0]!r}."
             " Give the demonstrations that the file was made from."
         )
     demos = demos.select(names=used)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from functools import partial
 
 import numpy as np
 import torch
@@ -263,21 +263,19 @@ class HandMotions:
         owner = self.demos.sequence_of_frame
         lengths = np.diff(self.demos.frame_offsets)
         todo = np.unique(owner[self.demos.hand_valid])
-        robot = self.model.robot
         parts = []
-        jobs = []
         for sequences in batches(todo, small=_SMALL_BATCH, most=_SEQUENCES_PER_BATCH):
             rows = np.flatnonzero(np.isin(owner, sequences))
             is_frame = np.arange(lengths[sequences].max()) < lengths[sequences, None]
-            targets = self._targets(sequences, rows, is_frame)
-            parts.append((rows, is_frame))
-            jobs.append(_HandJob(robot, str(self.model.device), targets, self._config))
+            parts.append((rows, is_frame, self._targets(sequences, rows, is_frame)))
         compute = in_processes if self.model.device.type == "cpu" else map
+        follow_hand = partial(
+            _hand_motion, self.model.robot, str(self.model.device), self._config.hand
+        )
+        motions = compute(follow_hand, [targets for _, _, targets in parts])
         done = 0
-        for (rows, is_frame), job, motion in zip(
-            parts, jobs, compute(_hand_motion, jobs), strict=True
-        ):
-            yield HandBatch(rows, is_frame, job.targets, motion)
+        for (rows, is_frame, targets), motion in zip(parts, motions, strict=True):
+            yield HandBatch(rows, is_frame, targets, motion)
             done += len(is_frame)
             progress(done, len(todo))
 
@@ -354,20 +352,13 @@ class HandBatch:
     """The hand's motion."""
 
 
-class _HandJob(NamedTuple):
-    """The retargeting of one batch of hands."""
-
-    robot: RobotSpec
-    device: str
-    targets: HandTargets
-    config: RetargetConfig
-
-
-def _hand_motion(job: _HandJob) -> HandState:
-    """Return the hand's motion."""
-    model = HandModel(job.robot, device=job.device)
+def _hand_motion(
+    robot: RobotSpec, device: str, weights: HandWeights, targets: HandTargets
+) -> HandState:
+    """Return the hand's motion; a function of a module, for other processes."""
+    model = HandModel(robot, device=device)
     with one_thread():
-        return retarget_hand(model, job.targets, job.config.hand)
+        return retarget_hand(model, targets, weights)
 
 
 def _arm_targets(

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -88,25 +88,18 @@ def track(
     return joints, measures
 
 
-class _Job(NamedTuple):
-    """Arguments of :func:`track`."""
-
-    robot: RobotSpec
-    path: ArmTargets
-    thresholds: Thresholds
-    config: ArmSearch
-
-
 def track_each(
     robot: RobotSpec, paths: Sequence[ArmTargets], thresholds: Thresholds, config: ArmSearch
 ) -> Iterator[tuple[Tensor, Measures]]:
     """Yield what :func:`track` returns for each path, computed on all cores."""
-    yield from in_processes(_track, [_Job(robot, path, thresholds, config) for path in paths])
+    yield from in_processes(partial(_track, robot, thresholds, config), paths)
 
 
-def _track(job: _Job) -> tuple[Tensor, Measures]:
-    with one_thread():
-        return track(ArmModel(job.robot), job.path, job.thresholds, job.config)
+@one_thread()
+def _track(
+    robot: RobotSpec, thresholds: Thresholds, config: ArmSearch, path: ArmTargets
+) -> tuple[Tensor, Measures]:
+    return track(ArmModel(robot), path, thresholds, config)
 
 
 def _better_paths(problem: ArmProblem, paths: Paths, joints: Tensor, worth: Tensor) -> Tensor:

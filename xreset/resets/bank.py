@@ -7,7 +7,7 @@ goal (the paper's appendix D.c). Shape letters: L states, C rejected candidates,
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from math import inf
 from pathlib import Path
@@ -186,9 +186,6 @@ def starts_and_goals(
     geometry."""
     start_pos, start_quat = motions.start_pose
     goal_pos, goal_quat = motions.goal_pose
-    sources = {o.name: o.source for o in objects}
-    masses = {o.name: o.mass for o in objects}
-    frictions = {o.name: o.friction or 0.0 for o in objects}
     return ResetBank(
         **no_states(robot),
         sequence_name=motions.sequence_name,
@@ -197,11 +194,20 @@ def starts_and_goals(
         start_quat_wxyz=start_quat.astype(np.float32),
         goal_pos=goal_pos.astype(np.float32),
         goal_quat_wxyz=goal_quat.astype(np.float32),
-        object_names=motions.object_names,
-        object_sources=tuple(sources.get(name, "") for name in motions.object_names),
-        object_mass=np.array([masses.get(name, 0.0) for name in motions.object_names]),
-        object_friction=np.array([frictions.get(name, 0.0) for name in motions.object_names]),
+        **object_columns(motions.object_names, objects),
     )
+
+
+def object_columns(names: tuple[str, ...], objects: Iterable[ObjectSpec]) -> dict[str, Any]:
+    """Return the fields of a bank that describe its objects [O]: their names, and what is known of them."""
+    known = {obj.name: obj for obj in objects}
+    listed = [known.get(name) for name in names]
+    return {
+        "object_names": names,
+        "object_sources": tuple(obj.source if obj else "" for obj in listed),
+        "object_mass": np.array([obj.mass if obj else 0.0 for obj in listed]),
+        "object_friction": np.array([(obj.friction if obj else 0.0) or 0.0 for obj in listed]),
+    }
 
 
 def write_bank(

@@ -34,6 +34,7 @@ from xreset.resets.bank import (
     bank_problem,
     check_objects,
     no_states,
+    object_columns,
     stated_sources,
 )
 from xreset.resets.config import GoalConfig
@@ -390,7 +391,6 @@ def _reached(reach: Reach, drawn: Sequence[_Episode]) -> list[_Episode]:
 def _goal_set(robot: RobotSpec, episodes: Sequence[_Episode]) -> GoalSet:
     """Return the episodes as a goal set, with the poses of mesh frames."""
     objects = {e.obj.name: e.obj for e in episodes}
-    names = tuple(sorted(objects))
     return GoalSet(
         **no_states(robot),
         sequence_name=np.array([f"{e.obj.name}/{e.family}_{e.number:03d}" for e in episodes]),
@@ -400,8 +400,5 @@ def _goal_set(robot: RobotSpec, episodes: Sequence[_Episode]) -> GoalSet:
         start_quat_wxyz=np.array([quat_of(e.start_turn) for e in episodes], np.float32),
         goal_pos=np.array([e.goal - e.goal_turn.apply(e.obj.com) for e in episodes], np.float32),
         goal_quat_wxyz=np.array([quat_of(e.goal_turn) for e in episodes], np.float32),
-        object_names=names,
-        object_sources=tuple(objects[name].source for name in names),
-        object_mass=np.array([objects[name].mass for name in names]),
-        object_friction=np.array([objects[name].friction or 0.0 for name in names]),
+        **object_columns(tuple(sorted(objects)), objects.values()),
     )

@@ -165,16 +165,9 @@ class _Jaw:
         poses = kinematics.link_poses(joints, balls.links)
         own = poses[:, balls.link[model.pad_balls]]
         centers = matvec(own[..., :3, :3], balls.centers[model.pad_balls]) + own[..., :3, 3]
-        thumb = torch.isin(
-            balls.link[model.pad_balls],
-            torch.tensor(
-                [
-                    balls.links.index(x)
-                    for x in model.robot.fingertips[0].contact_links
-                    if x in balls.links
-                ]
-            ),
-        )
+        of_thumb = model.robot.fingertips[0].contact_links
+        is_thumb = torch.tensor([link in of_thumb for link in balls.links])
+        thumb = is_thumb[balls.link[model.pad_balls]]
         across = centers[:, ~thumb].mean(dim=1) - centers[:, thumb].mean(dim=1)
         self.across = torch.nn.functional.normalize(across, dim=-1)
         """[Q, 3] unit vector from the thumb's pad to the finger's."""

@@ -149,9 +149,7 @@ def _at_object(
     meet = _boxes_meet(model, turn, shift, link, fields, objects.object_index[frame], clearance)
     frame = frame[meet]
     owner, ball = members(balls.first[link[meet]], balls.count[link[meet]])
-    local = matvec(turn[meet].index_select(0, owner), balls.centers[ball]) + shift[
-        meet
-    ].index_select(0, owner)
+    local = _placed(turn[meet], shift[meet], owner, balls.centers[ball])
     frame = frame[owner]
     near, distance, away = fields.nearer(
         local, objects.object_index[frame], balls.radii[ball] + clearance
@@ -193,9 +191,7 @@ def _in_each_other(
     pair = pair[meet]
     owner, guard = members(balls.first_guard[a[pair]], balls.guard_count[a[pair]])
     ball = balls.guards[guard]
-    local = matvec(turn[meet].index_select(0, owner), balls.centers[ball]) + shift[
-        meet
-    ].index_select(0, owner)
+    local = _placed(turn[meet], shift[meet], owner, balls.centers[ball])
     near, distance, away = balls.fields.nearer(
         local, b[pair[owner]], balls.guard_radii[guard] - self_depth
     )
@@ -210,6 +206,11 @@ def _in_each_other(
         slope=bodies.slope(frame, centers, direction, first[pair], second[pair]),
         number=2 * len(balls.radii) + pair * len(balls.guards) + guard,
     )
+
+
+def _placed(turn: Tensor, shift: Tensor, owner: Tensor, points: Tensor) -> Tensor:
+    """[N, 3] points [N, 3] of frames ``owner`` [N], with rotations [K, 3, 3] and origins [K, 3]."""
+    return matvec(turn.index_select(0, owner), points) + shift.index_select(0, owner)
 
 
 def _boxes_meet(

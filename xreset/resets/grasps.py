@@ -19,7 +19,6 @@ from torch import Tensor
 from xreset.files.checks import frozen
 from xreset.geometry.rotations import (
     homogeneous,
-    matrix_to_quat,
     matvec,
     quat_from_axis_angle,
     quat_to_matrix,
@@ -28,10 +27,10 @@ from xreset.geometry.surface import Surface, prepared_surface
 from xreset.physics.tensors import Tensors, one_thread
 from xreset.resets.bank import ResetBank
 from xreset.retarget.arm.config import QUICK
-from xreset.retarget.arm.model import ArmModel, ArmTargets
-from xreset.retarget.arm.solve import track
+from xreset.retarget.arm.model import ArmModel
+from xreset.retarget.arm.solve import reach_poses
 from xreset.retarget.hand.model import HandModel
-from xreset.retarget.validity import REASONS, Thresholds, classify
+from xreset.retarget.validity import REASONS, Thresholds
 from xreset.spec import ObjectSpec, RobotSpec
 
 _CONE = float(np.radians(25.0))
@@ -340,9 +339,8 @@ def _reason(arm: ArmModel, root: Tensor, joints: Tensor) -> Tensor:
     """[N] index into ``REASONS``: why the arm cannot carry the hand's root to [N, 4, 4]; 0 if it can."""
     if not len(root):
         return torch.zeros(0, dtype=torch.long)
-    targets = ArmTargets.of_poses(root[:, :3, 3], matrix_to_quat(root[:, :3, :3]), joints[:, None])
-    _, measures = track(arm, targets, _THRESHOLDS, QUICK)
-    return classify(measures, _THRESHOLDS)[:, 0]
+    _, reason = reach_poses(arm, root, joints[:, None], _THRESHOLDS, QUICK)
+    return reason
 
 
 def _poses(pos: np.ndarray, quat: np.ndarray) -> Tensor:

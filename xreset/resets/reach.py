@@ -12,12 +12,12 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from xreset.geometry.rotations import matrix_to_quat
+from xreset.geometry.rotations import homogeneous
 from xreset.physics.tensors import one_thread
 from xreset.retarget.arm.config import QUICK
-from xreset.retarget.arm.model import ArmModel, ArmTargets
-from xreset.retarget.arm.solve import track
-from xreset.retarget.validity import Thresholds, classify
+from xreset.retarget.arm.model import ArmModel
+from xreset.retarget.arm.solve import reach_poses
+from xreset.retarget.validity import Thresholds
 from xreset.spec import RobotSpec
 
 _TILTS = (0.0, 30.0, -30.0)
@@ -91,10 +91,7 @@ class Reach:
     def _reached(self, center: np.ndarray, hand: Rotation) -> np.ndarray:
         """[N] bool: whether the arm carries the hand to N orientations with the point between its fingers at [N, 3]."""
         center = np.column_stack((center[:, :2], np.maximum(center[:, 2], _LOWEST)))
-        targets = ArmTargets.of_poses(
-            torch.as_tensor(center - hand.apply(self._center)),
-            matrix_to_quat(torch.as_tensor(hand.as_matrix())),
-            self._hand_joints,
-        )
-        _, measures = track(self._model, targets, _THRESHOLDS, QUICK)
-        return (classify(measures, _THRESHOLDS) == 0)[:, 0].numpy()
+        origin = torch.as_tensor(center - hand.apply(self._center))
+        root = homogeneous(torch.as_tensor(hand.as_matrix()), origin)
+        _, reason = reach_poses(self._model, root, self._hand_joints, _THRESHOLDS, QUICK)
+        return (reason == 0).numpy()

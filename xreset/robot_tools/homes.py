@@ -10,10 +10,9 @@ import torch
 
 from xreset.files.checks import frozen
 from xreset.geometry.collision import table_clearance
-from xreset.geometry.rotations import matrix_to_quat
-from xreset.retarget.arm.model import ArmModel, ArmTargets
-from xreset.retarget.arm.solve import track
-from xreset.retarget.validity import Thresholds, classify
+from xreset.retarget.arm.model import ArmModel
+from xreset.retarget.arm.solve import reach_poses
+from xreset.retarget.validity import Thresholds
 from xreset.robot_tools.check import MOST_TOUCHING, touching_itself
 from xreset.robot_tools.draft import rounded
 from xreset.spec import RobotSpec
@@ -62,22 +61,21 @@ def _held_at(robot: RobotSpec, T_world_root: np.ndarray, steps: torch.Tensor) ->
     """Return the robot with a home at the first place, of the pose [4, 4] moved by steps [S, 3], that is free; if there
     is none, at the first place that the arm reaches."""
     model = ArmModel(robot)
-    root = torch.as_tensor(T_world_root)
+    root = torch.as_tensor(T_world_root).repeat(len(steps), 1, 1)
+    root[:, :3, 3] += steps
     hand = torch.as_tensor(robot.home[model.hand.joint_indices])
-    quat = matrix_to_quat(root[:3, :3]).expand(len(steps), 4)
-    targets = ArmTargets.of_poses(root[:3, 3] + steps, quat, hand)
-    joints, measures = track(model, targets, Thresholds())
-    reached = np.flatnonzero(classify(measures, Thresholds())[:, 0] == 0)
+    joints, reason = reach_poses(model, root, hand, Thresholds())
+    reached = np.flatnonzero(reason == 0)
     if not len(reached):
         return None
-    height = table_clearance(model.kinematics, model.full(joints[reached, 0], hand), model.table)
+    height = table_clearance(model.kinematics, model.full(joints[reached], hand), model.table)
     clear = reached[(height > _CLEAR).numpy()]
     places = clear if len(clear) else reached
     for place in places:
-        held = _with_arm_at(robot, model, joints[place, 0].numpy())
+        held = _with_arm_at(robot, model, joints[place].numpy())
         if touching_itself(held, moved_by_arm=True) <= MOST_TOUCHING:
             return _Held(robot=held, place=int(place), is_free=len(clear) > 0)
-    held = _with_arm_at(robot, model, joints[places[0], 0].numpy())
+    held = _with_arm_at(robot, model, joints[places[0]].numpy())
     return _Held(robot=held, place=int(places[0]), is_free=False)
 
 

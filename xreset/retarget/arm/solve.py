@@ -88,6 +88,31 @@ def track(
     return joints, measures
 
 
+def reach_poses(
+    model: ArmModel,
+    root: Tensor,
+    hand_joints: Tensor,
+    thresholds: Thresholds,
+    config: ArmSearch | None = None,
+) -> tuple[Tensor, Tensor]:
+    """Find arm joints that carry the hand to poses, each for itself.
+
+    Args:
+        model: the robot.
+        root: [S, 4, 4] poses of the hand root.
+        hand_joints: [J_hand], or [S, 1, J_hand] rad (m).
+        thresholds: limits of a valid pose.
+        config: weights and effort.
+
+    Returns:
+        Arm joints [S, n], and the reason why each pose is not valid [S], 0 if it is:
+        :func:`~xreset.retarget.validity.classify`.
+    """
+    targets = ArmTargets.of_poses(root[:, :3, 3], matrix_to_quat(root[:, :3, :3]), hand_joints)
+    joints, measures = track(model, targets, thresholds, config)
+    return joints[:, 0], classify(measures, thresholds)[:, 0]
+
+
 def track_each(
     robot: RobotSpec, paths: Sequence[ArmTargets], thresholds: Thresholds, config: ArmSearch
 ) -> Iterator[tuple[Tensor, Measures]]:

@@ -46,7 +46,8 @@ def main(folder: str, object_name: str, seconds: float = float("inf")) -> None:
             stamps = [self.newest[topic].header.stamp for topic in TOPICS]
             times = [stamp.sec + stamp.nanosec * 1e-9 for stamp in stamps]
             return runtime.Reading(
-                joint_pos=np.array(joints.position)[rows], joint_vel=np.array(joints.velocity)[rows],
+                joint_pos=np.array(joints.position)[rows],
+                joint_vel=np.array(joints.velocity)[rows] if len(joints.velocity) else None,
                 joint_time=times[0], object_pos=pos, object_quat=quat, object_time=times[1],
             )  # fmt: skip
 

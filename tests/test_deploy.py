@@ -443,6 +443,17 @@ class ToyTest(InFolder):
             for value, joint in zip(target, joints, strict=True):
                 self.assertTrue(joint["lower"] - 1e-6 <= value <= joint["upper"] + 1e-6)
 
+    def test_a_ros_2_node_without_velocities_moves_nothing(self):
+        said = io.StringIO()
+        with (
+            ros(self.contract, self.home, velocity=()) as published,
+            contextlib.redirect_stdout(said),
+            self.assertLogs("xreset"),
+        ):
+            importlib.import_module("12_ros2_node").main(str(self.out), "brick", 30)
+        self.assertIn("needs joint_vel, which the reading does not have", said.getvalue())
+        assert_allclose(published, np.tile(self.home, (len(published), 1)), atol=1e-6)
+
     def test_a_ros_2_node_that_nobody_sends_to_any_more_stops(self):
         for kind, words in (
             ("PoseStamped", "The pose of the object is 1.0"),
@@ -530,7 +541,7 @@ class OfCloud(torch.nn.Module):
 
 
 @contextlib.contextmanager
-def ros(contract, home, vanishing=None):
+def ros(contract, home, vanishing=None, velocity=(0.0,) * 5):
     """A small stand-in for ROS 2: one node, whose topics send a robot at home; yields the published targets.
 
     After half a second, nobody sends messages of the kind ``vanishing`` any more.
@@ -552,9 +563,7 @@ def ros(contract, home, vanishing=None):
         if kind == "PoseStamped":
             return SimpleNamespace(header=stamp(), pose=pose)
         names = [joint["name"] for joint in contract["joints"]][::-1]
-        return SimpleNamespace(
-            header=stamp(), name=names, position=home[::-1], velocity=[0.0] * len(home)
-        )
+        return SimpleNamespace(header=stamp(), name=names, position=home[::-1], velocity=velocity)
 
     def spin_once(node, timeout_sec=0.01):
         clock.time += timeout_sec

@@ -108,7 +108,7 @@ def unknown_names(program):
     return unknown
 
 
-GIVEN = {"live.md": {"goal_pos", "goal_quat", "objects", "task"}}
+GIVEN = {"live.md": {"goal_pos", "goal_quat"}}
 """Names that the text of a page gives to its programs."""
 
 

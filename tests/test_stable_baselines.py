@@ -147,7 +147,7 @@ class PlayedTest(InOneFolder):
 
 
 class Network(torch.nn.Module):
-    """The actor, as docs/live.md wraps it."""
+    """The actor, as docs/gymnasium.md wraps it."""
 
     def __init__(self, model):
         super().__init__()

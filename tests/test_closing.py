@@ -21,10 +21,9 @@ from xreset import ClosingConfig, SqueezeConfig, read_bank
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.shapes import quat_of, turn_of
 from xreset.resets.closing import closing_states, positions_between, rotations_between
-from xreset.resets.distribution import ResetDistribution, bank_starts
+from xreset.resets.distribution import bank_starts
 from xreset.resets.fingers import Fingers, _balance, fingers_of, grip_forces, squeeze_targets
 from xreset.retarget.file import write_retargeted
-from xreset.task.config import ResetConfig
 
 ROBOT = toy_grasp.robot()
 JAW = ROBOT.joint_names.index("jaw_a_slide")
@@ -267,13 +266,8 @@ class TargetsTest(TestCase):
         self.assertEqual(plain.num_pressing, 0)
 
     def test_starts(self):
-        bank = self.pressing()
-        resets = ResetDistribution(
-            bank, ROBOT, tuple(bank.object_names), ResetConfig(demo_probability=0.5)
-        )
-        drawn = resets.sample(tensor([0, 1] * 50), torch.Generator().manual_seed(0))
-        assert_close(drawn.joint_target, drawn.joint_pos + 0.25 * drawn.from_bank[:, None])
-        chosen = bank_starts(bank)[tensor([4, 1])]
+        """Those that a training draws: tests/test_env.py."""
+        chosen = bank_starts(self.pressing())[tensor([4, 1])]
         assert_close(chosen.joint_target, chosen.joint_pos + 0.25)
 
 

@@ -316,7 +316,7 @@ class UsageTest(TestCase):
         code = (
             "import sys; sys.modules['rsl_rl'] = None; sys.stderr = sys.stdout\n"
             "from xreset.cli import main\n"
-            "try: main(['train', '--out', 'x', '--resets', 'x.npz'])\n"
+            "try: main(['train', '--out', 'x'])\n"
             "except SystemExit as end: assert end.code == 1"
         )
         words = r"^xreset train: rsl-rl-lib cannot .* pip install 'xreset\[train\]'"

@@ -240,13 +240,16 @@ def _check(option: _Option) -> None:
 
 def _check_overwriting(options: list[_Option]) -> None:
     """Refuse an output file that is another file of the command."""
-    paths = [option for option in options if isinstance(option.value, Path)]
-    for option in paths:
-        if not option.written or option.value.is_dir():
+    for option in options:
+        if not option.written or not isinstance(option.value, Path) or option.value.is_dir():
             continue
-        for other in paths:
-            if other is not option and other.value.resolve() == option.value.resolve():
+        for other in options:
+            several = isinstance(other.value, list | tuple)
+            files = other.value if several else [other.value]
+            paths = [file.resolve() for file in files if isinstance(file, Path)]
+            if other is not option and option.value.resolve() in paths:
+                which = "one of the" if several else "the"
                 raise XResetError(
-                    f"{option.flag} is {option.value}, which is also the {other.name.replace('_', ' ')}. "
+                    f"{option.flag} is {option.value}, which is also {which} {other.name.replace('_', ' ')}. "
                     "Nothing was overwritten; choose another file."
                 )

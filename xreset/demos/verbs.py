@@ -249,12 +249,13 @@ def select_demos(
         kept = demos.select(**selection.conditions())
     else:
         kept, others = demos.split(**selection.conditions())
-        write_demos(rest, others, config={"select_others": asdict(selection)}, inputs=inputs)
         if not selection.objects:
             _name_missing(kept, others, str(rest), say)
             _name_missing(others, kept, str(out or "the selection"), say)
     if mirror:
         kept = _mirrored(kept.select(sides=["left"]), meshes, say)
+    if rest is not None and others is not None:
+        write_demos(rest, others, config={"select_others": asdict(selection)}, inputs=inputs)
     if out is not None:
         config = {"select": asdict(selection), "mirrored": mirror}
         write_demos(out, kept, config=config, inputs=inputs)

@@ -136,30 +136,25 @@ def import_objects(
     path: str | Path,
     *,
     out: Output | None = None,
-    name: str | None = None,
     scale: float = 1.0,
     mass: float | None = None,
-    density: float | None = None,
     friction: float | None = None,
-    tolerance: float | None = None,
     png: Png | None = None,
     progress: Callable[[str, float, int], None] = unseen,
 ) -> list[Import]:
     """Cut a mesh, or every mesh of a folder, into convex pieces, and keep them for later runs.
 
-    A mesh file goes into a folder of objects (--out), which other commands take as --meshes. NAME.toml in this folder
-    holds mass and friction. The name of a built-in object puts it into such a folder as well.
+    A mesh file NAME.stl goes into a folder of objects (--out), which other commands take as --meshes. NAME.toml in this
+    folder holds mass or density, friction, and the tolerance of the pieces; after a change, import the folder again.
+    The name of a built-in object puts it into such a folder as well.
 
     Args:
         path: a mesh file; or a folder with NAME.obj, NAME/textured_simple.obj or NAME/textured.obj, in metres, in the
             frame of the object poses; or the name of a built-in object.
         out: folder of objects, for a mesh file or a built-in object.
-        name: name of the object in this folder; default: the name of the file.
         scale: length of a unit of the file in metres: 0.001 for millimetres.
         mass: mass in kg.
-        density: density in kg/m^3, instead of the mass.
         friction: friction coefficient: the middle of the range that training and evaluation draw from.
-        tolerance: largest deviation of the pieces from the surface, in metres; default: 0.002.
         png: picture to write: the meshes next to their pieces, with the deviation in millimetres.
         progress: called with (the mesh that is cut, meshes done, meshes in all).
 
@@ -171,16 +166,16 @@ def import_objects(
 
     path = Path(path)
     try:
-        properties = Properties(mass=mass, density=density, friction=friction, tolerance=tolerance)
+        properties = Properties(mass=mass, friction=friction)
     except ValueError as error:
         raise ObjectError(f"{error}.") from error
-    described = (name, scale, properties) != (None, 1.0, Properties())
+    described = (scale, properties) != (1.0, Properties())
     built_in = catalogue.official_name(str(path))
     if path.is_dir():
         if out is not None or described:
             raise ObjectError(
-                f"{path} is a folder. --out, --name, --scale, --mass, --density, --friction and --tolerance are for one"
-                " mesh file. For a folder, write these properties into NAME.toml next to each mesh."
+                f"{path} is a folder. --out, --scale, --mass and --friction are for one mesh file. For a folder, write "
+                "mass and friction into NAME.toml next to each mesh."
             )
         files = catalogue.mesh_files(path)
     elif not path.exists() and built_in not in catalogue.object_names():
@@ -192,14 +187,14 @@ def import_objects(
     elif not path.exists():
         if described:
             raise ObjectError(
-                f"{path} is a built-in object. --name, --scale, --mass, --density, --friction and --tolerance are for "
-                "mesh files; edit NAME.toml in the folder instead."
+                f"{path} is a built-in object. --scale, --mass and --friction are for mesh files; edit NAME.toml in "
+                "the folder instead."
             )
         written = procedural.write_stand_in(built_in, out)
         out = None  # it is there
         files = {built_in: written}
     else:
-        files = {name or path.stem: path}
+        files = {path.stem: path}
     found = []
     for object_name, file in files.items():
         progress(f"{object_name} ({file})", len(found), len(files))

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from xreset.errors import RunError, XResetError
 from xreset.eval.conditions import FAULTS, SWEPT, Condition, chosen_properties, nominal_task
-from xreset.eval.report import X
 from xreset.files.checks import (
     Mp4,
     Option,
@@ -205,15 +204,14 @@ def make_report(
     *,
     robot: str | Path | None = None,
     meshes: str | Path | None = None,
-    x: X | None = None,
-    curves: Annotated[Sequence[str], Option("curve")] = (),
     film: Mp4 | None = None,
     progress: Callable[[str, float, int], None] = unseen,
 ) -> Report:
     """Make a self-contained HTML page of a run's evaluations, or of several runs side by side, and its figures as CSV.
 
     Runs that differ only in their seed share a row of the table and a curve, with a band from the lowest to the highest
-    run. Notes say what makes runs incomparable, such as different demonstrations or versions of an engine.
+    run. Notes say what makes runs incomparable, such as different demonstrations or versions of an engine. TensorBoard
+    shows all learning curves; the page has success, success from home, grasps and return.
 
     Args:
         runs: run folders, folders of results (of a baseline, for example) or names of policies that ship with xreset
@@ -222,9 +220,6 @@ def make_report(
             several.
         robot: name or folder of the robot, for the films; default: as the run and the results name it.
         meshes: folder of real meshes, for the films; default: as the results name it.
-        x: horizontal axis of the learning curves; default: minutes as measured, or iterations if they are not known.
-        curves: learning curve to draw, as TensorBoard names it (task/grasped_from_home, episode/length, ...), or
-            several; default: success, success from home, grasps and return.
         film: MP4 to write as well: every object in every run and engine, next to each other.
         progress: called with the name of what is drawn.
 
@@ -232,7 +227,7 @@ def make_report(
         What the page shows.
 
     Raises:
-        RunError: there is nothing to report, labels are not unique, a curve is unknown, or nothing can be filmed.
+        RunError: there is nothing to report, labels are not unique, or nothing can be filmed.
         FileFormatError: a file is damaged.
         XResetError: the page cannot be written, another command is writing it, or a package for plots is missing.
     """
@@ -246,7 +241,7 @@ def make_report(
         out = trainings[0].folder / "report" if len(trainings) == 1 else "runs/report"
     films = {"robot": str(robot) if robot else None, "meshes": Path(meshes) if meshes else None}
     with claim_folder(Path(out)):
-        found = make.collect(trainings, x=x, curves=curves)
+        found = make.collect(trainings)
         progress("drawing films", 0, 0)
         found = make.write_report(found, Path(out), **films)
     if film is not None:

@@ -421,14 +421,14 @@ class PlotTest(Reported):
         self.write(("mujoco",))
         (training,) = read_trainings([str(self.folder)])
         groups = singles([replace(training, curves=CURVES)])
-        drawing = draw_training(groups, ["episode/return"], "iterations")
+        drawing = draw_training(groups, "iterations")
         self.assertTrue(drawing.startswith("<svg") and drawing.endswith("</svg>"))
         opening = drawing[: drawing.index(">")]
         self.assertIn("viewBox", opening)
         self.assertNotRegex(opening, r"\b(width|height)=")
         self.assertIn("currentColor", drawing)
         self.assertNotIn("#010203", drawing)
-        again = draw_training(groups, ["episode/return"], "iterations")
+        again = draw_training(groups, "iterations")
         self.assertEqual(drawing, again)
 
 

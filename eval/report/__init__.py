@@ -3,8 +3,3 @@
 from xreset.eval.verbs import make_report
 make_report("runs/soup")          # runs/soup/report/index.html
 """
-
-from typing import Literal
-
-X = Literal["minutes", "steps", "iterations"]
-"""Horizontal axis of a learning curve."""

@@ -10,14 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from math import ceil
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import pandas as pd
 
-from xreset.errors import RunError
 from xreset.eval.plots import COLORS, INK, svg
-from xreset.eval.report import X
 from xreset.eval.report.groups import Groups
 from xreset.eval.report.read import Training
 from xreset.eval.stats import Table
@@ -26,24 +24,22 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+X = Literal["minutes", "steps", "iterations"]
+"""Measure of the length of a training."""
 AXES: dict[X, tuple[str, int, str, float]] = {
     "minutes": ("minutes of training", 1, "minutes", 1.0),
     "steps": ("million environment steps", 1, "env_steps", 1e-6),
     "iterations": ("iterations of training", 0, "iteration", 1.0),
 }
-"""Label of an axis, digits in tables, field of :class:`~xreset.learning.clock.Lift`, and factor to the axis's unit."""
+"""Label of a measure, digits in tables, field of :class:`~xreset.learning.clock.Lift`, and factor to its unit."""
 _SPEED = ["speed/collect_seconds", "speed/learn_seconds", "speed/env_steps_per_second"]
-DEFAULT_CURVES = ("task/success", "task/success_from_home", "task/grasped", "episode/return")
-"""Curves that a report draws if a training has them."""
-TITLES = {
+CURVES = {
     "task/success": "at the goal",
     "task/success_from_home": "at the goal, from home",
     "task/grasped": "thumb and a finger press",
-    "task/grasped_from_home": "thumb and a finger press, from home",
     "episode/return": "episode return",
-    "episode/length": "episode length [control steps]",
 }
-"""Title of a curve's panel; other curves have their TensorBoard name."""
+"""Curve that a report draws if a training has it, as TensorBoard names it -> title of its panel."""
 _STYLES = ("-", (0, (5, 2)), (0, (1, 1.5)), (0, (5, 2, 1, 2)))
 """Line styles; the next one begins when the colors repeat: at the ninth training, the seventeenth, and so on."""
 _WIDTH = 10.6
@@ -56,44 +52,20 @@ _COLUMNS = 2
 
 def usual_axis(trainings: Sequence[Training]) -> X:
     """Return minutes if every training logged its speed, else iterations."""
-    try:
-        for training in trainings:
-            if len(training.curves):
-                amounts(training, "minutes")
-    except RunError:
-        return "iterations"
-    return "minutes"
+    logged = [training for training in trainings if len(training.curves)]
+    is_known = all(amounts(training, "minutes") is not None for training in logged)
+    return "minutes" if is_known else "iterations"
 
 
-def chosen_curves(trainings: Sequence[Training], wanted: Sequence[str]) -> tuple[str, ...]:
-    """Return the names of the curves to draw: the wanted ones, or else those of
-    :data:`DEFAULT_CURVES` that a training has, each once.
-
-    Raises:
-        RunError: no training has one of the wanted curves.
-    """
-    known = sorted(set().union(*(t.curves for t in trainings)))
-    if unknown := set(wanted) - set(known):
-        raise RunError(
-            f"Unknown curve {', '.join(sorted(unknown))}. Choose with --curve from: {', '.join(known) or 'none'}."
-        )
-    return tuple(dict.fromkeys(wanted)) or tuple(tag for tag in DEFAULT_CURVES if tag in known)
-
-
-def amounts(training: Training, x: X) -> Table:
+def amounts(training: Training, x: X) -> Table | None:
     """Return the amount of ``x`` after each iteration, in the unit of :data:`AXES`; the index is the iteration, rising.
-
-    Raises:
-        RunError: the training did not log its speed.
+    None: the training did not log its speed, by which minutes and steps are known.
     """
     curves = training.curves
     if x == "iterations":
         return pd.Series(curves.index.to_numpy(float), index=curves.index)
-    missing = [tag for tag in _SPEED if tag not in curves]
-    if missing:
-        raise RunError(
-            f"{training.label} did not log {', '.join(missing)}, so {x} are not known. Choose --x iterations."
-        )
+    if any(tag not in curves for tag in _SPEED):
+        return None
     speed = curves[_SPEED].dropna()
     seconds = speed[_SPEED[0]] + speed[_SPEED[1]]
     each = seconds / 60 if x == "minutes" else seconds * speed[_SPEED[2]] * 1e-6
@@ -103,7 +75,7 @@ def amounts(training: Training, x: X) -> Table:
 def line(members: Sequence[Training], tag: str, x: X) -> Table | None:
     """Return the curve of one training; or mean, minimum and maximum of several, in the range that all have logged.
 
-    Trainings without such a curve are left out; None if no training has one.
+    Trainings without such a curve, or whose ``x`` is not known, are left out; None if no training is left.
 
     Returns:
         Columns mean, low and high; the index is the amount of ``x``, rising.
@@ -111,8 +83,8 @@ def line(members: Sequence[Training], tag: str, x: X) -> Table | None:
     curves = []
     for training in members:
         values = training.curves.get(tag, pd.Series()).dropna()
-        if len(values):  # a training that broke down logs no number
-            done = amounts(training, x)
+        done = amounts(training, x)
+        if len(values) and done is not None:  # a training that broke down logs no number
             curves.append((np.interp(values.index, done.index, done), values))
     if not curves:
         return None
@@ -135,14 +107,17 @@ def color(index: int) -> str:
     return COLORS[index % len(COLORS)]
 
 
-def draw_training(groups: Groups, tags: Sequence[str], x: X) -> str:
-    """Return the drawing of learning curves as SVG, a panel for each; empty if there are none.
+def draw_training(groups: Groups, x: X) -> str:
+    """Return the drawing of :data:`CURVES` as SVG, a panel for each; empty if no training has one.
 
     Args:
         groups: the groups, each with a color of its own.
-        tags: curves that at least one training has.
         x: horizontal axis of the curves.
     """
+    logged: set[str] = set()
+    for members in groups.values():
+        logged = logged.union(*(member.curves for member in members))
+    tags = [tag for tag in CURVES if tag in logged]
     if not tags:
         return ""
     order = list(groups)
@@ -195,7 +170,7 @@ def draw_lines(ax: Axes, tag: str, lines: Mapping[str, Table], x: X, order: Sequ
         ax.plot(
             at, values["mean"], color=color(index), linestyle=_style(index), linewidth=1.5, **look
         )
-    ax.set_title(TITLES.get(tag, tag), fontsize="medium", loc="left")
+    ax.set_title(CURVES[tag], fontsize="medium", loc="left")
     ax.grid(axis="y", color=INK, alpha=0.12)
     if percent:
         ax.yaxis.set_major_formatter(lambda value, _: f"{value:g} %")

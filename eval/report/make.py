@@ -18,9 +18,9 @@ from xreset.eval import effects
 from xreset.eval.metrics import METRICS
 from xreset.eval.pages import percent, render
 from xreset.eval.plots import COLORS
-from xreset.eval.report import X, fairness, tables
+from xreset.eval.report import fairness, tables
 from xreset.eval.report.clips import Clip, draw_report
-from xreset.eval.report.curves import AXES, chosen_curves, draw_training, usual_axis
+from xreset.eval.report.curves import AXES, X, draw_training, usual_axis
 from xreset.eval.report.goals import goal_distances
 from xreset.eval.report.groups import (
     COUNTED,
@@ -80,8 +80,6 @@ class Report(Brief):
 def collect(
     trainings: Sequence[Training],
     *,
-    x: X | None = None,
-    curves: Sequence[str] = (),
     title: str = "",
     notes: Sequence[str] | None = None,
     page_tables: Sequence[PageTable] = (),
@@ -90,8 +88,6 @@ def collect(
 
     Args:
         trainings: the runs.
-        x: as of :func:`~xreset.eval.verbs.make_report`, and so are the next two.
-        curves: names of curves.
         title: title of the page; default: the policy, or the runs.
         notes: sentences about what is unfair; None: they are found here.
         page_tables: tables to show first.
@@ -104,15 +100,14 @@ def collect(
     if not title and len(trainings) == 1 and trainings[0].results:
         first = trainings[0].first
         title = f"{first.policy} on {first.robot}"
-    tags = chosen_curves(trainings, curves)
-    x = x or usual_axis(trainings)
+    x = usual_axis(trainings)
     return Report(
         title=title or ", ".join(groups),
         trainings=tuple(trainings),
         groups=groups,
         notes=tuple(dict.fromkeys(notes)),  # each sentence once
         scores=pd.concat([found, differences(groups)], ignore_index=True),
-        curves=draw_training(groups, tags, x),
+        curves=draw_training(groups, x),
         x=x,
         tables=page_tables,
     )

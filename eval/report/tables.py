@@ -7,7 +7,6 @@ from math import isnan
 
 from scipy.stats import binomtest
 
-from xreset.errors import RunError
 from xreset.eval.metrics import METRICS
 from xreset.eval.report.curves import AXES, X, amounts
 from xreset.eval.report.groups import EVERY, Groups, by_engine, certain_differences, counted
@@ -157,8 +156,7 @@ def _lengths(member: Training) -> dict[str, str]:
     if not len(member.curves):
         return lengths
     for x, (label, digits, *_) in AXES.items():
-        try:
-            lengths[label] = f"{amounts(member, x).iloc[-1]:,.{digits}f}"
-        except RunError:
-            continue
+        done = amounts(member, x)
+        if done is not None:
+            lengths[label] = f"{done.iloc[-1]:,.{digits}f}"
     return lengths

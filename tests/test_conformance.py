@@ -647,11 +647,15 @@ class Harness(InFolder):
         file = self.folder / "c.json"
         words = "engines check --engine mujoco --check free_fall"
         command = (*words.split(), "--json", file)
-        self.assertIn("no check failed", succeeds(*command))
+        said = succeeds(*command)
+        self.assertIn("no check failed", said)
         data = json.loads(file.read_text())
         self.assertEqual(data["schema"], "xreset-conformance/2")
         self.assertEqual(data["command"], f"xreset {words}")
-        self.assertEqual([c["verdict"] for c in data["runs"][0]["checks"]], ["passed"])
+        [check] = data["runs"][0]["checks"]
+        self.assertEqual(check["verdict"], "passed")
+        with self.subTest("a check that is named shows every number"):
+            self.assertEqual(said.count("passed:"), len(check["measures"]))
         broken = Measure(what="x", measured=float("nan"), tolerance=1.0)
 
         def red(check, bench):

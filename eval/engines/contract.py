@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection
 from functools import partial
 from typing import Any
 
@@ -16,7 +16,7 @@ Say = Callable[[str | Text], None]
 
 
 def check(
-    name: str, robot: RobotSpec, device: str, only: Iterable[str] | None, verbose: bool, say: Say
+    name: str, robot: RobotSpec, device: str, only: Collection[str], say: Say
 ) -> dict[str, Any]:
     """Check an engine, and return its entry in the file of :mod:`xreset.backends.conformance.results`.
 
@@ -24,17 +24,17 @@ def check(
         name: name of the engine.
         robot: robot to test with.
         device: where the engine runs if it can; else it runs on the CPU.
-        only: names of the checks to run; None: all.
-        verbose: say every measured number, not only the one nearest to its tolerance.
-        say: called with lines for people.
+        only: names of the checks to run; empty: all.
+        say: called with lines for people: every measured number of checks that are named, else the one nearest to its
+            tolerance.
     """
     status = backend_status(name)
     used = device if device.split(":")[0] in status.device else "cpu"
     make = _maker(name, used)  # refuses an unknown engine, so it comes before the headline
     what = f" {status.version}, {robot.name}, {used}: verdict, check, and what came nearest to its tolerance"
     say(Text.assemble((name, "bold"), what))
-    report = partial(_say_result, verbose=verbose, say=say)
-    results = conformance.run(make, robot=robot, only=only, report=report)
+    report = partial(_say_result, every=bool(only), say=say)
+    results = conformance.run(make, robot=robot, only=only or None, report=report)
     return {
         "engine": name,
         "engine_version": status.version,
@@ -74,12 +74,12 @@ _STYLE = {
 }
 
 
-def _say_result(result: conformance.CheckResult, verbose: bool, say: Say) -> None:
+def _say_result(result: conformance.CheckResult, every: bool, say: Say) -> None:
     detail = shown(result.worst) if result.measures else result.problem
     verdict = (f"{result.verdict:<16}", _STYLE[result.verdict])
     say(Text.assemble("  ", verdict, f" {result.name:<22} {result.seconds:5.1f} s  {detail}"))
     for measure in result.measures:
-        if verbose or measure.verdict != "passed":
+        if every or measure.verdict != "passed":
             say(f"{'':19}{measure.verdict}: {shown(measure)}")
             if measure.verdict == "known difference" and measure.known is not None:
                 say(f"{'':19}accepted up to {measure.known.bound:.3g}: {measure.known.reason}")

@@ -32,7 +32,6 @@ def check_engines(
     only: Annotated[Sequence[str], Option("check")] = (),
     json: Output | None = None,
     page: Output | None = None,
-    verbose: bool = False,
     say: Callable[[Any], None] = print,
 ) -> list[dict[str, Any]]:
     """Test whether physics engines keep their contract. The command exits with 1 if one does not.
@@ -41,10 +40,10 @@ def check_engines(
         engines: physics engine, or several; the command's default: all that can be used here.
         robot: name or folder of the robot to test with; default: a gripper, with which every check can run.
         device: where engines run that can use a GPU: cpu or cuda; the others run on the CPU.
-        only: check to run, or several; default: all.
+        only: check to run, or several, with every measured number; default: all, with the number of each that is
+            nearest to its tolerance.
         json: file to write the results to.
         page: Markdown page to write, with a table of the results.
-        verbose: show every measured number, not only the one nearest to its tolerance.
         say: called with lines about each check.
 
     Returns:
@@ -61,7 +60,7 @@ def check_engines(
     spec = load_robot(robot) if robot else conformance.scene().robot
     runs = []
     for name in [engines] if isinstance(engines, str) else dict.fromkeys(engines):
-        runs.append(contract.check(name, spec, device, only or None, verbose, say))
+        runs.append(contract.check(name, spec, device, only, say))
     found = measured({"schema": conformance.SCHEMA, "runs": runs})
     if json is not None:
         write_json(json, found)

@@ -25,6 +25,7 @@ _RENAMED = {
 }
 """Flag, or command and flag -> the flag's present name."""
 _NEEDLESS = {
+    "--verbose": "checks that --check names show every number",
     "--resume": "a training continues with --out RUN alone, or with its whole command",
 }
 """Flag that is ignored -> why."""

@@ -425,7 +425,6 @@ def play(
     robot: str | Path | None = None,
     demos: str | Path | None = None,
     meshes: str | Path | None = None,
-    seed: Seed = 0,
     host: str = "127.0.0.1",
     port: Port = 8080,
 ) -> None:
@@ -440,7 +439,6 @@ def play(
         demos: starts and goals: demonstrations, robot motion, reset states or a goal set; default: synthetic
             demonstrations.
         meshes: folder of real meshes; default: what the policy was trained with, else the stand-ins.
-        seed: seed of starts and goals.
         host: address to serve at; 0.0.0.0 allows other machines.
         port: port to serve at; if it is taken, the next free one.
 
@@ -456,7 +454,6 @@ def play(
         robot=robot,
         demos=Path(demos) if demos else None,
         meshes=Path(meshes) if meshes else None,
-        seed=seed,
         host=host,
         port=port,
     )

@@ -123,9 +123,9 @@ class PlaceTest(InFolder):
         with self.assertRaisesRegex(RobotError, "no frame to reach"):
             placing.place(self.robot, [none], NOWHERE, CONFIG)
         below = np.array([[0.45, 0.6, 0.0]])
-        narrow = replace(CONFIG, clear=0.35, tilt=(0.0, 0.0))
+        upright = replace(self.robot, base_quat=(1.0, 0.0, 0.0, 0.0))
         with self.assertRaisesRegex(RobotError, "no place .* 0.35 m away"):
-            placing.place(self.robot, [self.wrists], below, narrow)
+            placing.place(upright, [self.wrists], below, replace(CONFIG, clear=0.35))
         avoid = self.wrists.root_pos.numpy().reshape(-1, 3)
         with self.assertRaisesRegex(
             RobotError, "no place in the searched ranges is 9 m away.*Lower --search.clear"
@@ -136,7 +136,7 @@ class PlaceTest(InFolder):
         for changes, words in (
             ({"clear": -1.0}, "clear is -1.0, expected a number from 0 to 1e15"),
             ({"x": (1.0, 0.0)}, "x is .*two finite numbers, the lower one first"),
-            ({"tilt": (0.0, np.nan)}, "tilt is"),
+            ({"z": (0.0, np.nan)}, "z is"),
         ):
             with refuses(self, words, ValueError):
                 PlaceConfig(**changes)

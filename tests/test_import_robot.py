@@ -130,6 +130,7 @@ class Toy(Robots):
 
     def test_a_folder_that_passes_the_check_and_says_what_it_guessed(self):
         spec = self.spec
+        self.assertEqual(spec.name, "mine", "the name of its folder")
         links = {tip.name: tip.contact_links[0] for tip in spec.fingertips}
         self.assertEqual(
             links, {"thumb": "thumb_b", "index": "f1_b", "middle": "f2_b", "ring": "f3_b"}

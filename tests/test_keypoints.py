@@ -100,6 +100,11 @@ class Synthetic(InFolder):
             with self.subTest(order=order, units=units):
                 self.same(read_keypoints(path, convention))
 
+    def test_the_person_is_named_by_the_file_alone(self):
+        self.assertEqual(read_keypoints(self.npz(), PLAIN).subject.tolist(), ["unknown"])
+        found = read_keypoints(self.npz(subject=np.array("ann")), PLAIN)
+        self.assertEqual(found.subject.tolist(), ["ann"])
+
     def test_quaternions_say_their_order(self):
         wxyz = self.demos.object_quat_wxyz
         xyzw = np.roll(wxyz, -1, axis=1)

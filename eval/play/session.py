@@ -130,7 +130,6 @@ class Session:
         robot: str | Path | None = None,
         demos: Path | None = None,
         meshes: Path | None = None,
-        seed: int = 0,
     ) -> None:
         """Load what is to be played.
 
@@ -142,15 +141,13 @@ class Session:
             robot: default: the policy's.
             demos: starts and goals, from any file of demonstrations, motion or reset states; None: synthetic ones.
             meshes: folder of object meshes; None: the folder of the policy's training, or the stand-ins.
-            seed: chooses starts and goals.
 
         Raises:
             XResetError: the policy, the object, the robot or the engine cannot be used.
         """
         self._demos = demos
         self._folder = meshes
-        self._seed = seed
-        self.random = np.random.default_rng(seed)
+        self.random = np.random.default_rng(0)
         self.time = 0.0
         self._open(policy or default_policy(robot), robot, object_name, engine)
 
@@ -205,7 +202,7 @@ class Session:
             names = load_inputs(self._demos, robot=policy.robot, meshes=folder).bank.object_names
         usual = ALIASES["soup"]
         name = canonical_name(object_name or (usual if usual in names else names[0]), names)
-        source = self._demos or synthesize([name], STARTS, self._seed, meshes=folder)
+        source = self._demos or synthesize([name], STARTS, meshes=folder)
         inputs = load_inputs(source, robot=policy.robot, meshes=folder, only=[name])
         scene = scene_of(policy.robot, inputs.objects[0], policy.task)
         start, *goal = self._drawn(inputs.bank, scene)

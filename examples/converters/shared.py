@@ -99,5 +99,5 @@ def convert(
     )
     print(
         f"{options.out}: {len(points)} frames. Next: xreset demos import keypoints {options.out} --out demos.npz"
-        f" --order {recording.order} --units m --coordinates table --subject NAME --meshes FOLDER"
+        f" --order {recording.order} --units m --coordinates table --meshes FOLDER"
     )

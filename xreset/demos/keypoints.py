@@ -87,8 +87,6 @@ class Convention:
     """The grasped object."""
     side: Literal["right", "left"] | None = None
     """The hand."""
-    subject: str = "unknown"
-    """The demonstrating person."""
 
 
 def read_keypoints(
@@ -310,7 +308,7 @@ def _sequence(arrays: Arrays, convention: Convention) -> Demos:
     valid = np.asarray(np.isfinite(points).all(axis=(1, 2)))
     return one_sequence(
         name=_text(arrays, "sequence", None),
-        subject=_text({"subject": np.array(convention.subject), **arrays}, "subject", None),
+        subject=_text({"subject": np.array("unknown"), **arrays}, "subject", None),
         object_name=official_name(_text(arrays, "object", convention.object_name)),
         side=side,
         fps=fps,

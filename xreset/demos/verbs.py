@@ -64,7 +64,6 @@ def import_keypoints(
     fps: float | None = None,
     object_name: Annotated[str | None, Option("object")] = None,
     side: Literal["right", "left"] | None = None,
-    subject: str = "unknown",
     meshes: str | Path | None = None,
     trust: Annotated[bool, Option("trust_recordings")] = False,
 ) -> Demos:
@@ -83,7 +82,6 @@ def import_keypoints(
         fps: frames per second; files with times are resampled to it.
         object_name: name of the grasped object, if the files do not state it.
         side: side of the hand, if the files do not state it.
-        subject: name of the person, if the files do not state it.
         meshes: folder of the objects' meshes, to examine the recordings with.
         trust: take recordings that are certainly wrong all the same.
 
@@ -104,7 +102,6 @@ def import_keypoints(
         fps=fps,
         object_name=object_name,
         side=side,
-        subject=subject,
     )
     demos = read_keypoints(path, convention, meshes=meshes, trust=trust)
     config = {
@@ -177,8 +174,6 @@ class Selection(Options):
     """Names of objects: only sequences that grasp one of them."""
     sequences: tuple[str, ...] = ()
     """Only the sequences of these names."""
-    subjects: tuple[str, ...] = ()
-    """Only sequences that these persons demonstrated."""
     side: Literal["right", "left", "both"] = "both"
     """Only sequences of this hand."""
     per_object: PositiveInt | None = None
@@ -199,7 +194,6 @@ class Selection(Options):
         return {
             "objects": self.objects or None,
             "names": self.sequences or None,
-            "subjects": self.subjects or None,
             "sides": None if self.side == "both" else [self.side],
             "max_per_object": self.per_object,
             "share": self.share,

@@ -92,7 +92,6 @@ def make_robot(
     hand: Path,
     out: Path,
     *,
-    name: str | None = None,
     flange: str | None = None,
     offset: tuple[float, float, float] | None = None,
     rpy: tuple[float, float, float] | None = None,
@@ -135,7 +134,7 @@ def make_robot(
             tree, mounting = _carried(found, carrier, offset, rpy, notes)
             to_say.insert(0, mounting)
         tree = _with_efforts(tree, found.root, notes)
-        tree = replace(tree, name=name or out.resolve().name)
+        tree = replace(tree, name=out.resolve().name)
         spec = draft_spec(
             tree, found.root, work, tips=found.tips, keypoints=found.keypoints, bent=found.bent
         )

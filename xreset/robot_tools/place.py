@@ -197,8 +197,7 @@ def _candidates(
     elite: list[RobotSpec],
 ) -> list[RobotSpec]:
     """Return the candidates of a round: first evenly over the ranges, then around the elite."""
-    own = _parameters(robot)[4]
-    tilt = config.tilt or (own, own)
+    tilt = _parameters(robot)[[4, 4]]  # as the description has it
     turn = (-180.0, 180.0)
     low, high = np.array([config.x, config.y, config.z, turn, tilt, turn]).T
     spread = (high - low) / 4 * _SHRINK**number

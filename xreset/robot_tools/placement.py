@@ -28,8 +28,6 @@ class PlaceConfig(Checked):
     """Range of the base's position [m]; the defaults are the table and what is next to it."""
     y: Span = (-0.5, 1.2)
     z: Span = (0.0, 0.8)
-    tilt: Span | None = None
-    """Range of the angle between the base's z axis and the vertical [degrees]; None: as the description has it."""
     clear: NonNegativeFloat = 0.30
     """Least distance [m] from the base's origin to every wrist and object of the demonstrations; what is below an
     upright base keeps the same distance."""

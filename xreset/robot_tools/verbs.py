@@ -62,7 +62,6 @@ def import_robot(
     hand: str | Path,
     out: Output,
     *,
-    name: str | None = None,
     flange: str | None = None,
     offset: Vector | None = None,
     rpy: Vector | None = None,
@@ -77,8 +76,7 @@ def import_robot(
         arm: URDF or MJCF of the arm, or name or folder of a robot whose arm is taken; leave it out if the hand's file
             holds the arm as well.
         hand: URDF or MJCF of the hand. Joints that move all fingers become joints of the arm.
-        out: folder to make.
-        name: name of the robot; default: the folder's.
+        out: folder to make; its name is the robot's.
         flange: link of the arm that carries the hand; default: one that makers call so, or the arm's last link.
         offset: position of the hand's root link in the flange's frame [m]; default: the origin, moved out of the arm
             until the hand's body is in front of the flange.
@@ -100,7 +98,6 @@ def import_robot(
         Path(arm) if arm else None,
         Path(hand),
         Path(out),
-        name=name,
         flange=flange,
         offset=offset,
         rpy=rpy,

@@ -166,5 +166,8 @@ def nominal_task(task: TaskConfig) -> TaskConfig:
     still = RandomizationConfig(
         friction=(middle, middle),
         mass_scale=(1.0, 1.0),
+        elastomer=r.elastomer,
+        metal=r.metal,
+        table=r.table,
     )
     return replace(task, randomization=still)

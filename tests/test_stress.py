@@ -23,13 +23,15 @@ class StressedTest(TestCase):
     def test_nothing_is_random_and_one_thing_differs(self):
         task = evaluation_task(
             TaskConfig(
-                randomization=RandomizationConfig(arm_stiffness=(0.5, 2.0), friction=(0.4, 0.8))
+                randomization=RandomizationConfig(
+                    arm_stiffness=(0.5, 2.0), friction=(0.4, 0.8), metal=0.2
+                )
             )
         )
         plain = nominal_task(task).randomization
         self.assertEqual(
-            (plain.friction, plain.mass_scale, plain.arm_stiffness),
-            ((0.6000000000000001,) * 2, (1, 1), (1, 1)),
+            (plain.friction, plain.mass_scale, plain.arm_stiffness, plain.metal),
+            ((0.6000000000000001,) * 2, (1, 1), (1, 1), 0.2),
         )
         self.assertTrue(plain.enabled and not plain.scales_drives)
         for prop in SWEPT:

@@ -47,9 +47,7 @@ from xreset.spec import TableSpec
 from xreset.task import observations as obs
 from xreset.task.actions import ActionSpace
 from xreset.task.config import (
-    ELASTOMER,
     GROUPS,
-    TABLE,
     ActionConfig,
     ObservationConfig,
     PushConfig,
@@ -59,11 +57,11 @@ from xreset.task.config import (
     TaskConfig,
     TrackerConfig,
     evaluation_task,
-    pair_friction,
 )
 from xreset.task.latency import DelayLine
 from xreset.task.pushes import Pushes
 from xreset.task.randomization import (
+    pair_friction,
     sample_drives,
     sample_friction,
     sample_offset,
@@ -578,22 +576,24 @@ class LatencyTest(TestCase):
 
 class RandomizationTest(TestCase):
     def test_a_pairs_friction_is_the_mean_of_its_materials(self):
-        self.assertEqual(pair_friction(0.5), (0.65, 0.3, 0.5))
-        self.assertEqual(pair_friction(1.0, link=0.5), (0.9, 0.75, 0.75))
+        c = RandomizationConfig(elastomer=0.8, metal=0.1, table=0.5)
+        assert_close(
+            pair_friction(tensor([0.5, 1.0]), c), tensor([[0.65, 0.3, 0.5], [0.9, 0.55, 0.75]])
+        )
         nominal = sample_friction(3, RandomizationConfig(enabled=False), generator())
-        assert_close(nominal, tensor(pair_friction(0.75)).expand(3, 3))
+        assert_close(nominal, pair_friction(torch.full((3,), 0.75), c))
 
     def test_friction_comes_from_the_buckets(self):
         c = RandomizationConfig(friction=(0.5, 1.0), hand_friction=(0.5, 1.0))
         tip, link, table = sample_friction(20_000, c, generator()).unbind(-1)
-        material = 2 * table - TABLE
-        drawn = 2 * link - (2 * tip - ELASTOMER)
+        material = 2 * table - c.table
+        drawn = 2 * link - (2 * tip - c.elastomer)
         for values in (material, drawn):
             assert_range(values, 0.5, 1.0, atol=2e-3)
             self.assertAlmostEqual(values.mean(), 0.75, delta=0.005)
         self.assertEqual(len(material.mul(1e5).round().unique()), 250)
         with patch("xreset.task.randomization.MATERIALS", 2):
-            material = 2 * sample_friction(100, c, generator())[:, 2] - TABLE
+            material = 2 * sample_friction(100, c, generator())[:, 2] - c.table
         # the middles of the halves of the range
         assert_close(material.unique(), tensor([0.625, 0.875]))
 

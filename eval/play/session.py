@@ -32,7 +32,7 @@ from xreset.resets.bank import ResetBank
 from xreset.resets.inputs import load_inputs
 from xreset.runtime import Controller, Reading
 from xreset.spec import GRAVITY, ObjectSpec, PairFriction, RobotSpec, SceneSpec
-from xreset.task.config import TaskConfig, evaluation_task, pair_friction
+from xreset.task.config import TaskConfig, evaluation_task
 from xreset.task.terminations import out_of_bounds
 
 RESTS = "zero"
@@ -479,7 +479,7 @@ def scene_of(robot: RobotSpec, obj: ObjectSpec, task: TaskConfig) -> SceneSpec:
     """Return the scene in which a policy is played: that of its evaluations, with the friction of the object."""
     task = evaluation_task(task)
     middle = sum(task.randomization.friction) / 2
-    pairs = pair_friction(middle if obj.friction is None else obj.friction)
+    pairs = task.randomization.pair_friction(middle if obj.friction is None else obj.friction)
     tip, link, table = (max(pair, LEAST_FRICTION) for pair in pairs)
     return SceneSpec(
         robot=robot,

@@ -23,12 +23,7 @@ REMOVED: dict[str, dict[str, Any]] = {
         "home_gravity_clip": 0.3,
         "home_noise": True,
     },
-    "RandomizationConfig": {
-        "friction_buckets": 250,
-        "elastomer": 0.8,
-        "metal": 0.1,
-        "table": 0.5,
-    },
+    "RandomizationConfig": {"friction_buckets": 250},
     "ModelConfig": {
         "initial_hand_std": None,
         "synergy_std": None,

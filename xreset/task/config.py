@@ -319,6 +319,13 @@ class RandomizationConfig(Checked):
     enabled: bool = True
     friction: Range = (0.5, 1.0)
     """Range of the object material's coefficient."""
+    elastomer: NonNegativeFloat = 0.8
+    """Coefficient of the fingertips' material. The friction of a pair is the mean of its two materials, as in the
+    paper's simulator."""
+    metal: NonNegativeFloat = 0.1
+    """Coefficient of every other link's material."""
+    table: NonNegativeFloat = 0.5
+    """Coefficient of the table's material. Not in the paper."""
     mass_scale: PositiveRange = (0.7, 1.3)
     """Range of the factor on the object's mass."""
     torsional_friction: Range = (1.0, 1.0)
@@ -328,7 +335,7 @@ class RandomizationConfig(Checked):
     object_com: Range = (0.0, 0.0)
     """Range of the distance [m] by which the object's centre of mass is moved, in any direction."""
     hand_friction: Range | None = None
-    """Range of the coefficient of every link's material except the fingertips'; None: :data:`METAL`."""
+    """Range of the coefficient of every link's material except the fingertips'; None: ``metal``."""
     arm_stiffness: Range = (1.0, 1.0)
     """Range of the factor on the stiffness of the arm's drives, the same for all of them."""
     arm_damping: Range = (1.0, 1.0)
@@ -365,6 +372,17 @@ class RandomizationConfig(Checked):
     camera_latency: Range = (0.0, 0.0)
     """Range of the additional age of images [control steps], rounded to whole steps."""
 
+    def pair_friction(self, material: Any, link: Any = None) -> tuple[Any, Any, Any]:
+        """Return the friction of the pairs object-fingertip, object-link, object-table: numbers or tensors.
+
+        Args:
+            material: the object material's coefficient. A pair's coefficient is the mean of its two materials.
+            link: coefficient of the links except the fingertips; None: ``metal``.
+        """
+        others = (self.elastomer, self.metal if link is None else link, self.table)
+        tip, link, table = ((material + other) / 2 for other in others)
+        return tip, link, table
+
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.tracker.jitter and not self.observation_latency[1]:
@@ -392,25 +410,6 @@ class RandomizationConfig(Checked):
 
 
 _AS_STATED = RandomizationConfig()
-ELASTOMER = 0.8
-"""Coefficient of the fingertips' material (Table IX)."""
-METAL = 0.1
-"""Coefficient of every other link's material (Table IX)."""
-TABLE = 0.5
-"""Coefficient of the table's material. Not in the paper."""
-
-
-def pair_friction(material: Any, link: Any = METAL) -> tuple[Any, Any, Any]:
-    """Return the friction of the pairs object-fingertip, object-link, object-table: numbers or tensors.
-
-    A pair's coefficient is the mean of its two materials, as in the paper's simulator.
-
-    Args:
-        material: coefficient of the object's material.
-        link: coefficient of the links except the fingertips.
-    """
-    tip, other, table = ((material + partner) / 2 for partner in (ELASTOMER, link, TABLE))
-    return tip, other, table
 
 
 @frozen

@@ -7,7 +7,15 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from xreset.task.config import METAL, RandomizationConfig, pair_friction
+from xreset.task.config import RandomizationConfig
+
+
+def pair_friction(
+    material: Tensor, c: RandomizationConfig, link: Tensor | float | None = None
+) -> Tensor:
+    """[M, 3] :meth:`RandomizationConfig.pair_friction` of materials [M] and of links [M]."""
+    return torch.stack(c.pair_friction(material, link), dim=-1)
+
 
 MATERIALS = 250
 """Number of distinct materials of objects (Table IX)."""
@@ -19,15 +27,14 @@ def sample_friction(count: int, c: RandomizationConfig, generator: torch.Generat
     Without randomization it is the material in the middle.
     """
     low, high = c.friction
-    link = METAL
-    if c.enabled:
-        bucket = torch.randint(MATERIALS, (count,), generator=generator, device=generator.device)
-        material = low + (high - low) * (bucket + 0.5) / MATERIALS
-        if c.hand_friction is not None:
-            link = sample_range(count, c.hand_friction, generator)
-    else:
-        material = torch.full((count,), (low + high) / 2, device=generator.device)
-    return torch.stack(pair_friction(material, link), dim=-1)
+    if not c.enabled:
+        return pair_friction(torch.full((count,), (low + high) / 2, device=generator.device), c)
+    bucket = torch.randint(MATERIALS, (count,), generator=generator, device=generator.device)
+    material = low + (high - low) * (bucket + 0.5) / MATERIALS
+    link = None
+    if c.hand_friction is not None:
+        link = sample_range(count, c.hand_friction, generator)
+    return pair_friction(material, c, link)
 
 
 def own_friction(materials: Sequence[float | None], c: RandomizationConfig) -> Tensor:

@@ -147,6 +147,10 @@ class UsageTest(TestCase):
             (r"--mp4 is x, expected a name that ends in \.mp4", "view d.npz --mp4 x"),
             (r"--picture is x\.jpg, expected", "robots check openarm --picture x.jpg"),
             (r"Nothing was overwritten", "retarget d.npz --robot openarm --out ./d.npz"),
+            (
+                r"--out is d\.npz, which is also one of the files",
+                "demos select c.npz d.npz --out ./d.npz",
+            ),
         ):
             with self.subTest(arguments[:80]):
                 code, out, err = run(*arguments.split())

@@ -499,6 +499,14 @@ class Synthetic(InFolder):
 
 
 class Commands(InFolder):
+    def test_no_rest_is_written_without_a_selection(self):
+        file = self.folder / "right.npz"
+        rest = self.folder / "rest.npz"
+        write_demos(file, synthesize(["soup"], 2, fps=10))
+        said = refused("demos", "select", file, "--per-object", 1, "--mirror", "--rest", rest)
+        self.assertIn("no hand side left", said)
+        self.assertFalse(rest.exists())
+
     def test_one_sequence_is_not_called_sequences(self):
         file = self.folder / "one.npz"
         said = succeeds("demos", "synth", "--objects", "soup", "--per-object", 1, "--out", file)

@@ -507,6 +507,16 @@ class Commands(InFolder):
         self.assertIn("no hand side left", said)
         self.assertFalse(rest.exists())
 
+    def test_what_is_given_twice_is_named(self):
+        file = self.folder / "one.npz"
+        out = self.folder / "out.npz"
+        write_demos(file, synthesize(["soup"], 1, fps=10))
+        said = refused("demos", "select", file, self.folder / "." / "one.npz", "--out", out)
+        self.assertIn("one.npz is given twice. Give each archive once.", said)
+        said = refused("demos", "synth", "--objects", "soup", "005_tomato_soup_can", "--out", out)
+        self.assertIn("The object 005_tomato_soup_can is given twice. Name each object once.", said)
+        self.assertFalse(out.exists())
+
     def test_one_sequence_is_not_called_sequences(self):
         file = self.folder / "one.npz"
         said = succeeds("demos", "synth", "--objects", "soup", "--per-object", 1, "--out", file)

@@ -79,6 +79,10 @@ def synthetic_demos(
     if unknown := sorted(set(sides) - set(SIDES)):
         raise DemoError(f"side is {unknown[0]!r}, expected 'right', 'left' or 'both'.")
     specs = load_objects(names, meshes)
+    given = [spec.name for spec in specs]
+    for i, name in enumerate(given):
+        if name in given[:i]:
+            raise DemoError(f"The object {name} is given twice. Name each object once.")
     parts = []
     for side in sides:
         for spec in specs:

@@ -232,10 +232,14 @@ def select_demos(
         The sequences that meet the conditions; and, if they have a file, the others.
 
     Raises:
-        DemoError: a condition is wrong, or no sequence is left.
+        DemoError: a condition is wrong, no sequence is left, or an archive is given twice.
     """
     from xreset.demos.archive import merge_demos, read_demos, write_demos
 
+    places = [Path(file).resolve() for file in files]
+    for i, place in enumerate(places):
+        if place in places[:i]:
+            raise DemoError(f"The archive {files[i]} is given twice. Give each archive once.")
     demos = merge_demos([*map(read_demos, files)])
     inputs = {f"demos {i}": file_hash(file) for i, file in enumerate(files)}
     others = None

@@ -392,6 +392,16 @@ class ToyTest(InFolder):
         found = np.array([line.split() for line in found.splitlines()], float)
         assert_allclose(found, self.expected(readings, steps), atol=1e-6)
 
+        result = subprocess.run([program], capture_output=True, text=True, check=False)
+        self.assertEqual(result.returncode, 2)
+        self.assertIn("usage: policy POLICY.onnx STEPS", result.stderr)
+        short = subprocess.run(
+            [program, self.out / "policy.onnx", "2"],
+            input=lines[0], capture_output=True, text=True, check=False,
+        )  # fmt: skip
+        self.assertEqual(short.returncode, 1)
+        self.assertRegex(short.stderr, "the readings end, or are no number, at .* of step 1")
+
     def expected(self, readings, steps):
         """Return the graph's targets [steps, J], by onnxruntime."""
         session = onnxruntime.InferenceSession(self.graph, providers=["CPUExecutionProvider"])

@@ -21,7 +21,11 @@ void check(OrtStatus* status) {
   std::exit(1);
 }
 
-int main(int, char** arguments) {
+int main(int count, char** arguments) {
+  if (count != 3) {
+    std::fprintf(stderr, "usage: policy POLICY.onnx STEPS < readings > targets\n");
+    return 2;
+  }
   OrtEnv* env;
   OrtSessionOptions* options;
   OrtSession* session;
@@ -62,7 +66,10 @@ int main(int, char** arguments) {
     std::vector<float>* memory = nullptr;
     for (size_t i = 0; i < inputs; i++) {
       if (names[i] == std::string("memory_in")) memory = &values[i];
-      else for (float& value : values[i]) if (std::scanf("%f", &value) != 1) return 1;
+      else for (float& value : values[i]) if (std::scanf("%f", &value) != 1) {
+        std::fprintf(stderr, "policy: the readings end, or are no number, at %s of step %d\n", names[i], step);
+        return 1;
+      }
     }
     OrtValue* results[] = {nullptr, nullptr};
     float* numbers[2];

@@ -205,9 +205,7 @@ class ConverterTest(InFolder):
         assert_allclose(points[..., 2], scene.heights, atol=1e-4)
         written["object"] = np.array("005_tomato_soup_can")
         np.savez(out, **written)
-        demos = read_keypoints(
-            out, Convention(order=order, units="m", frame="table", subject="s1", fps=30.0)
-        )
+        demos = read_keypoints(out, Convention(order=order, units="m", frame="table", fps=30.0))
         self.assertEqual(demos.num_frames, scene.frames)
         return demos
 

@@ -187,6 +187,15 @@ class Wrong(InFolder):
             found = examine(replace(demos, **changed))
             self.assertIn(words, " ".join(map(str, found)), "without a mesh")
 
+    def test_fingertips_of_other_fingers(self):
+        demos = synthesize(["soup"], 1)
+        keypoints = demos.hand_keypoints.copy()
+        keypoints[:, [16, 20]] = demos.hand_keypoints[:, [20, 16]]
+        found = [
+            str(each) for each in examine(replace(demos, hand_keypoints=keypoints)) if each.wrong
+        ]
+        self.assertIn("fingertips of ring and little fit each other's fingers", " ".join(found))
+
     def test_commands_say_the_same_and_one_option_overrules(self):
         demos = synthesize(["soup"], 1, seed=1, fps=10)
         down = np.array([0.0, 0.0, -0.06], dtype=np.float32)

@@ -14,6 +14,7 @@ from itertools import chain
 from pathlib import Path
 
 import numpy as np
+from scipy.optimize import linear_sum_assignment
 
 from xreset.demos.archive import Demos, demo_objects, levelled
 from xreset.demos.causes import MOVED, Recording, length_text, likeliest_cause, unnoticed_cause
@@ -24,6 +25,7 @@ from xreset.files.checks import frozen
 from xreset.files.processes import batches, in_processes
 from xreset.geometry.shapes import turn_of
 from xreset.geometry.surface import Surface, prepared_surface
+from xreset.spec import FINGERS
 
 TRUST = "If the recording is right all the same, add --trust-recordings (in Python: trust=True)."
 """The one way to use what is refused."""
@@ -57,6 +59,8 @@ _ALONG = 0.9
 """Cosine of wrist and fingers: at least 0.983; 0.35 and -0.67 at the median if read in a wrong order."""
 _THUMB_RATIO = 0.75
 """The thumb's first joint is nearer to the wrist than this share of a knuckle's distance: 0.53."""
+_TIPS_RATIO = 1.12
+"""Last bones of the fingers together, as a ratio to those with the best order of tips: at most 1.09 in DexYCB."""
 _ADULT = 0.79
 """Mean length of the bones of DexYCB's people [m]."""
 _ONE_PLACE = 0.01
@@ -360,7 +364,20 @@ def _order_problem(points: np.ndarray) -> str:
     row = np.median(((points[:, 5::4] - points[:, 5:6]) * across[:, None]).sum(axis=-1), axis=0)
     if not (np.diff(row) > 0).all():
         return "The knuckles are not in a row from the index to the little finger."
-    return ""
+    return _tips_problem(points)
+
+
+def _tips_problem(points: np.ndarray) -> str:
+    """Return which fingertips of keypoints [F, 21, 3] fit better to other fingers; empty if none does."""
+    last_joints = points[:, 3::4]
+    tips = points[:, 4::4]
+    bones = np.linalg.norm(last_joints[:, :, None] - tips[:, None], axis=-1)
+    lengths = np.median(bones, axis=0)
+    fingers, fitting = linear_sum_assignment(lengths)
+    if np.trace(lengths) <= _TIPS_RATIO * lengths[fingers, fitting].sum():
+        return ""
+    wrong = [FINGERS[finger] for finger in np.flatnonzero(fitting != fingers)]
+    return f"The fingertips of {' and '.join(wrong)} fit each other's fingers: they are in another order."
 
 
 def _fixed_point(r: Recording) -> str:

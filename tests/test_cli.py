@@ -198,7 +198,6 @@ class UsageTest(TestCase):
             ),
             ("report a --curve task/success", "--curve is gone: the page has success"),
             ("objects import a.stl --out b --density 900", "--density is gone: write it into NAME"),
-            ("robots import --hand a --out b --name c", "--name is gone: an object has the name"),
             ("eval zero --demos none --settle", "--settle is gone: episodes begin as recorded"),
             ("resets none --out b.npz --squeeze.weight 0", "press with --squeeze.force and the"),
             ("resets none --out b.npz --squeeze.reach=0.1", "--squeeze.reach is gone: fingers"),

@@ -412,19 +412,21 @@ class MeshImport(InFolder):
                 read_mesh(self.folder / name)
 
     def test_the_command_puts_a_mesh_into_a_folder_and_draws_it(self):
-        path = self.write(trimesh.creation.box((100, 60, 40)), "brick")
+        path = self.write(trimesh.creation.box((100, 60, 40)))
         out = self.folder / "objects"
         png = self.folder / "a.png"
         command = ("objects", "import", path, "--scale", 0.001, "--mass", 0.2)
         self.assertIn("Add --out", refused(*command))
         self.assertIn("There is no no.stl.", refused("objects", "import", "no.stl"))
         self.assertRegex(
-            succeeds(*command, "--out", out, "--png", png),
+            succeeds(*command, "--out", out, "--name", "brick", "--png", png),
             r"brick\W+0.2\W+100x60x40\W+1 hull",
         )
         self.assertTrue(png.read_bytes().startswith(b"\x89PNG"))
         self.assertIn("brick", succeeds("objects", "import", out))
-        self.assertIn("rename the mesh file", refused(*command, "--out", out))
+        again = refused(*command, "--out", out, "--name", "brick")
+        self.assertIn("choose another --name or --out", again)
+        refused(*command, "--out", out, "--name", "[/bold]")
         (out / "brick.toml").write_text("density = 1000.0\ntolerance = 0.001\n")
         self.assertRegex(succeeds("objects", "import", out), r"brick\W+0.24\W+100x60x40\W+1 ")
 

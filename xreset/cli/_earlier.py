@@ -40,7 +40,6 @@ _GONE = {
     "--apart": "runs that differ only in their seed share a row; xreset report RUN shows one of them",
     "--curve": "the page has success, grasps and return, and TensorBoard shows all curves",
     "--x": "curves are drawn over minutes, and TensorBoard draws them over any axis",
-    "--name": "an object has the name of its mesh file, a robot that of its folder",
     "--density": "write it into NAME.toml of the folder of objects, and import this folder",
     "--tolerance": "write it into NAME.toml of the folder of objects, and import this folder",
     "--settle": "episodes begin as recorded, because starts at rest gained nothing",

@@ -229,8 +229,7 @@ def add_mesh(
     known = replace(properties, tolerance=properties.tolerance or Settings.tolerance).to_toml()
     if target.exists() or (facts.exists() and facts.read_bytes() != known.encode()):
         raise ObjectError(
-            f"{target} or its .toml is there already. Nothing was changed; rename the mesh file, or choose "
-            "another --out."
+            f"{target} or its .toml is there already. Nothing was changed; choose another --name or --out."
         )
     from trimesh.exchange.obj import export_obj
 

@@ -136,6 +136,7 @@ def import_objects(
     path: str | Path,
     *,
     out: Output | None = None,
+    name: str | None = None,
     scale: float = 1.0,
     mass: float | None = None,
     friction: float | None = None,
@@ -152,6 +153,7 @@ def import_objects(
         path: a mesh file; or a folder with NAME.obj, NAME/textured_simple.obj or NAME/textured.obj, in metres, in the
             frame of the object poses; or the name of a built-in object.
         out: folder of objects, for a mesh file or a built-in object.
+        name: name of the object in this folder; default: the name of the file.
         scale: length of a unit of the file in metres: 0.001 for millimetres.
         mass: mass in kg.
         friction: friction coefficient: the middle of the range that training and evaluation draw from.
@@ -169,13 +171,13 @@ def import_objects(
         properties = Properties(mass=mass, friction=friction)
     except ValueError as error:
         raise ObjectError(f"{error}.") from error
-    described = (scale, properties) != (1.0, Properties())
+    described = (name, scale, properties) != (None, 1.0, Properties())
     built_in = catalogue.official_name(str(path))
     if path.is_dir():
         if out is not None or described:
             raise ObjectError(
-                f"{path} is a folder. --out, --scale, --mass and --friction are for one mesh file. For a folder, write "
-                "mass and friction into NAME.toml next to each mesh."
+                f"{path} is a folder. --out, --name, --scale, --mass and --friction are for one mesh file. For a "
+                "folder, write mass and friction into NAME.toml next to each mesh."
             )
         files = catalogue.mesh_files(path)
     elif not path.exists() and built_in not in catalogue.object_names():
@@ -187,14 +189,14 @@ def import_objects(
     elif not path.exists():
         if described:
             raise ObjectError(
-                f"{path} is a built-in object. --scale, --mass and --friction are for mesh files; edit NAME.toml in "
-                "the folder instead."
+                f"{path} is a built-in object. --name, --scale, --mass and --friction are for mesh files; edit "
+                "NAME.toml in the folder instead."
             )
         written = procedural.write_stand_in(built_in, out)
         out = None  # it is there
         files = {built_in: written}
     else:
-        files = {path.stem: path}
+        files = {name or path.stem: path}
     found = []
     for object_name, file in files.items():
         progress(f"{object_name} ({file})", len(found), len(files))

@@ -83,8 +83,8 @@ _CLOCKS_DIFFER = 0.1
 class Runner:
     """Keeps a policy's rate on a driver, and stops softly when it cannot go on.
 
-    A pose that is late is used until it is ``pose_age`` old; until the first usable data, the targets stay. Data that
-    are not finite, older than the last ones, or ahead of the driver's clock are ignored. After a fault the targets slow
+    A pose that is late is used until it is ``pose_age`` old. Nothing is sent before the first usable data. Data that
+    are not finite, older than the last ones, or ahead of the clock are ignored. After a fault the targets slow
     down within ``slow_down``, and then stay.
     """
 
@@ -175,6 +175,8 @@ class Runner:
         running = self._running[:, None]
         self._move = np.where(running, target - self._sent, self._move)
         self._sent = np.where(running, target, self._slowed(now))
+        if not self.outcome.steps:
+            return True  # the targets of begin may be far from where the robot is
         try:
             self.driver.send(self._sent[0] if self._one_robot else self._sent)
         except Exception as error:
@@ -208,7 +210,7 @@ class Runner:
             return self._sent
         self._check(reading, now)
         running = self._running
-        is_new = now - reading.object_time <= self.limits.pose_age
+        is_new = np.asarray(now - reading.object_time <= self.limits.pose_age)
         is_new &= now - reading.joint_time <= self.limits.joint_age
         if not running.any() or not is_new[running].all():
             return self._sent

@@ -34,6 +34,7 @@ CAUSES = {
     "hand: relative to the wrist": "relative to the hand",
     "hand: in the object's frame": "given in the object's frame",
     "order: little finger to thumb": "from the little finger to the thumb",
+    "order: thumb last": "from the index to the little finger, and then to the thumb",
     "order: tips to bases": "if each finger goes from tip to base",
     "order: MANO's as MediaPipe's": "--order mano",
     "absent: hand is -1": "write NaN, where the hand was not seen",

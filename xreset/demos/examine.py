@@ -358,7 +358,13 @@ def _order_problem(points: np.ndarray) -> str:
     bases = np.median(from_wrist, axis=0)
     thumb = int(np.argmin(bases))
     if bases[thumb] < _THUMB_RATIO * bases[0]:
-        order = " The fingers may go from the little finger to the thumb." * (thumb == 4)
+        order = ""
+        if thumb == 4:
+            to_thumb = np.linalg.norm(points[:, [1, 13]] - points[:, 17:18], axis=2)
+            first, fourth = np.median(to_thumb, axis=0)
+            order = " The fingers may go from the little finger to the thumb."
+            if first < fourth:
+                order = " The fingers may go from the index to the little finger, and then to the thumb."
         return f"Of the five fingers, number {thumb + 1} begins next to the wrist, as only a thumb does.{order}"
     across = points[:, 17] - points[:, 5]
     row = np.median(((points[:, 5::4] - points[:, 5:6]) * across[:, None]).sum(axis=-1), axis=0)

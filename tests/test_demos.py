@@ -559,6 +559,14 @@ class Commands(InFolder):
         said = succeeds("demos", "select", file, one, "--per-object", "1", "--rest", rest)
         self.assertIn("011_banana: no sequence is left", said)
 
+    def test_select_by_person(self):
+        file, known, new = (f"{self.folder}/{name}.npz" for name in ("demos", "known", "new"))
+        demos = synthesize(["soup"], 2, fps=10)
+        write_demos(file, replace(demos, subject=np.array(["ann", "bob"])))
+        succeeds("demos", "select", file, "--subjects", "ann", "--out", known, "--rest", new)
+        self.assertEqual(read_demos(known).subject.tolist(), ["ann"])
+        self.assertEqual(read_demos(new).subject.tolist(), ["bob"])
+
     def test_import(self):
         file = self.folder / "demos.npz"
         self.assertIn(

@@ -174,6 +174,8 @@ class Selection(Options):
     """Names of objects: only sequences that grasp one of them."""
     sequences: tuple[str, ...] = ()
     """Only the sequences of these names."""
+    subjects: tuple[str, ...] = ()
+    """Only sequences that these persons demonstrated."""
     side: Literal["right", "left", "both"] = "both"
     """Only sequences of this hand."""
     per_object: PositiveInt | None = None
@@ -194,6 +196,7 @@ class Selection(Options):
         return {
             "objects": self.objects or None,
             "names": self.sequences or None,
+            "subjects": self.subjects or None,
             "sides": None if self.side == "both" else [self.side],
             "max_per_object": self.per_object,
             "share": self.share,

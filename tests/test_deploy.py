@@ -38,7 +38,7 @@ from xreset import (
     synthesize,
 )
 from xreset.errors import PolicyError, XResetError
-from xreset.eval.rollout import engine, episode_starts, load_trial
+from xreset.eval.rollout import engine, episode_starts, load_trial, roll_out
 from xreset.live import cache
 from xreset.live.deploy import deployed_graph, with_objects, write_deployed
 from xreset.live.engine import EngineDriver
@@ -480,6 +480,18 @@ class ToyTest(InFolder):
             self.assertIn(words, said.getvalue())
             self.assertLess(len(published), 120)
             assert_allclose(np.diff(published[-3:], axis=0), 0, atol=1e-3)
+
+    def test_an_evaluation_plays_the_graph_as_it_plays_the_network(self):
+        trial = toy_grasp.trial(self.task)
+        played = []
+        for file in (self.network, self.out / "policy.onnx"):
+            spec = load_policy(file, robot=self.robot)
+            found = roll_out(spec.start(None), engine("mujoco", workers=0), trial, episodes=1)
+            played.append(found)
+        first, second = (rollouts.traces for rollouts in played)
+        for a, b in zip(first, second, strict=True):
+            assert_allclose(a.joint_target, b.joint_target, atol=1e-5)
+            assert_allclose(a.object_pos, b.object_pos, atol=1e-4)
 
 
 class EndlessTest(InFolder):

@@ -8,7 +8,6 @@ from __future__ import annotations
 import io
 import multiprocessing
 import os
-import signal
 import sys
 import time
 import unittest
@@ -66,12 +65,6 @@ class Result(unittest.TextTestResult):
 def keep_to_a_core(cores) -> None:
     """Take one of the cores for this process, so that what it tests starts no processes for the others."""
     os.sched_setaffinity(0, {cores.get()})
-    restore_interrupts()
-
-
-def restore_interrupts() -> None:
-    # A process in the background of a script ignores Ctrl-C, and so do its children, which some tests interrupt.
-    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def run(name: str) -> Outcome:
@@ -116,7 +109,6 @@ def run_all(names: list[str], processes: int):
 
 
 def main() -> int:
-    restore_interrupts()
     arguments = sys.argv[1:]
     names = [a for a in arguments if not a.startswith("-")]
     if "--quick" in arguments:

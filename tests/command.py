@@ -4,9 +4,16 @@ import contextlib
 import functools
 import inspect
 import io
+import os
+import signal
+import subprocess
+import threading
 from unittest.mock import patch
 
 from xreset.cli import main
+
+# A process in the background of a script ignores Ctrl-C, and so do its children, which some tests interrupt.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def xreset(*arguments):
@@ -34,6 +41,34 @@ def refused(*arguments):
     code, out, err = xreset(*arguments)
     assert code == 1, f"exit status {code}: {err}"
     return out + err
+
+
+@contextlib.contextmanager
+def started(*words, seconds=120, **options):
+    """Start a program whose output the test reads, and yield its process. After the time limit the program and its own
+    children are killed, so that no reader waits for ever, and the test fails."""
+    late = threading.Event()
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+    command = [str(word) for word in words]
+    with subprocess.Popen(command, start_new_session=True, **pipes | options) as process:
+
+        def kill():
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+
+        def end():
+            late.set()
+            kill()
+
+        limit = threading.Timer(seconds, end)
+        limit.start()
+        try:
+            yield process
+        finally:
+            limit.cancel()
+            kill()
+            if late.is_set():
+                raise AssertionError(f"{' '.join(command)} did not end within {seconds} s")
 
 
 @contextlib.contextmanager

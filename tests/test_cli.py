@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+import time
 import zipfile
 from collections.abc import Callable, Sequence
 from contextlib import redirect_stderr
@@ -17,7 +18,7 @@ from unittest.mock import Mock, patch
 
 import tyro
 
-from tests.command import calls_of, refused, succeeds
+from tests.command import calls_of, refused, started, succeeds
 from tests.command import xreset as run
 from tests.data import InFolder
 from xreset.backends import pybullet
@@ -67,6 +68,19 @@ def commands():
         if isinstance(group, dict):
             found += [[name, *verb.split()] for verb in group]
     return found
+
+
+class StartedTest(TestCase):
+    def test_no_test_waits_for_ever_for_a_program(self):
+        """Nor for the program's child, which has its output open, too."""
+        sleeping = "import subprocess; subprocess.run(['sleep', '60'])"
+        began = time.monotonic()
+        with (
+            self.assertRaisesRegex(AssertionError, r"sleep.* did not end within 0\.5 s"),
+            started(sys.executable, "-c", sleeping, seconds=0.5) as process,
+        ):
+            process.stdout.read()
+        self.assertLess(time.monotonic() - began, 30)
 
 
 class LightnessTest(TestCase):

@@ -13,6 +13,7 @@ from unittest import TestCase, mock
 import torch
 from torch.testing import assert_close
 
+from tests.command import started
 from tests.data import InFolder
 from tests.toy_training import WithBank
 from xreset.learning.distributed import Processes
@@ -148,10 +149,8 @@ class ScriptsTest(InFolder):
         self.environment["PYTHONPATH"] = str(ROOT)
 
     def start(self, script, *arguments):
-        return subprocess.Popen(
-            ["bash", SCRIPTS / script, *map(str, arguments)], cwd=self.folder, env=self.environment,
-            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
-        )  # fmt: skip
+        command = ("bash", SCRIPTS / script, *arguments)
+        return self.enterContext(started(*command, cwd=self.folder, env=self.environment))
 
     def test_two_nodes_find_each_other_and_stop_in_time(self):
         package = self.folder / "stand-in" / "xreset"

@@ -7,6 +7,7 @@ import sys
 import tempfile
 import textwrap
 import time
+from contextlib import contextmanager
 from dataclasses import fields, replace
 from itertools import product
 from pathlib import Path
@@ -17,6 +18,7 @@ import torch
 from torch import tensor
 from torch.testing import assert_close
 
+from tests.command import started
 from tests.data import refuses
 from tests.toy_world import ToyBackend, ToyWorld, toy_scene
 from xreset.backends.pool import World, is_finite
@@ -285,19 +287,17 @@ class DeathTest(TestCase):
             pool.step(1)
         self.assertRaisesRegex(XResetError, "is closed", pool.step, 1)
 
-    def script(self, body, **options):
+    @contextmanager
+    def script(self, body):
         source = "from tests.toy_world import *\n" + textwrap.dedent(body)
         with tempfile.NamedTemporaryFile("w", suffix=".py") as file:
             file.write(source)
             file.flush()
-            process = subprocess.Popen(
-                [sys.executable, file.name], env={**os.environ, "PYTHONPATH": str(REPOSITORY)}, text=True,
-                stdout=subprocess.PIPE, stderr=subprocess.PIPE, **options,
-            )  # fmt: skip
-            yield process
-            if process.poll() is None:
-                process.kill()
-            process.communicate()
+            environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
+            with started(
+                sys.executable, file.name, env=environment, stderr=subprocess.PIPE
+            ) as process:
+                yield process
 
     def test_a_script_without_main_guard_or_close_ends_cleanly(self):
         body = """
@@ -305,8 +305,8 @@ class DeathTest(TestCase):
         pool.step()
         print(pool._team._workers[0]._process.pid)
         """
-        for process in self.script(body):
-            out, err = process.communicate(timeout=60)
+        with self.script(body) as process:
+            out, err = process.communicate()
             self.assertEqual((process.returncode, err), (0, ""))
             self.assert_gone(int(out))
 
@@ -318,10 +318,10 @@ class DeathTest(TestCase):
             pool.step()
         """
         for number in (signal.SIGINT, signal.SIGKILL):
-            for process in self.script(body):
+            with self.script(body) as process:
                 worker = int(process.stdout.readline())
                 process.send_signal(number)
-                _, err = process.communicate(timeout=60)
+                _, err = process.communicate()
                 self.assertEqual(err.count("Traceback"), 1 if number == signal.SIGINT else 0, err)
                 self.assert_gone(worker)
 

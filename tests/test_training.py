@@ -7,7 +7,6 @@ import os
 import pty
 import shutil
 import signal
-import subprocess
 import sys
 import threading
 import time
@@ -24,7 +23,7 @@ from numpy.testing import assert_array_equal
 from onnx import numpy_helper
 from torch.testing import assert_close
 
-from tests.command import calls_of
+from tests.command import calls_of, started
 from tests.data import refuses
 from tests.toy_bank import SOUP, SPAM, toy_bank
 from tests.toy_goals import toy_goals
@@ -329,9 +328,7 @@ class TrainingTest(WithBank):
             f" --recipe {recipe}"
         )
         words = [sys.executable, *command.split()]
-        process = subprocess.Popen(
-            words, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-        )
+        process = self.enterContext(started(*words))
         while len(checkpoints(out)) < 2 and process.poll() is None:
             time.sleep(0.05)
         process.send_signal(signal.SIGTERM)

@@ -2,7 +2,6 @@
 
 import io
 import signal
-import subprocess
 import sys
 import time
 import urllib.request
@@ -23,7 +22,7 @@ from websockets.typing import Subprotocol
 
 from tests import toy_bank
 from tests.browser import wait_until
-from tests.command import refused, succeeds
+from tests.command import refused, started, succeeds
 from tests.data import InOneFolder, refuses
 from tests.toy_bank import SOUP, SPAM
 from tests.toy_goals import toy_goals
@@ -346,11 +345,8 @@ class Served(WithFiles):
         self.assertIn(f"sequence 0: {name}", texts)
 
     def test_the_command_serves_until_interrupted(self):
-        command = [sys.executable, "-u", "-m", "xreset", "view", str(self.bank), "--port", "8960"]
-        process = self.enterContext(
-            subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
-        )
-        self.addCleanup(process.kill)  # before the context waits for its end
+        command = (sys.executable, "-u", "-m", "xreset", "view", self.bank, "--port", "8960")
+        process = self.enterContext(started(*command))
         line = next((line for line in process.stdout if " at http" in line), "")
         self.assertIn("6 reset states", line)
         with urllib.request.urlopen(line.split()[-1], timeout=20) as answer:

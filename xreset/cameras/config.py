@@ -15,6 +15,7 @@ from xreset.files.checks import (
     PositiveInt,
     Rule,
     Share,
+    first_repeated,
     frozen,
 )
 from xreset.files.text import shown
@@ -138,8 +139,8 @@ def camera_of(camera: str | CameraConfig) -> CameraConfig:
 
 def check_each_once(cameras: Sequence[CameraConfig]) -> None:
     """Refuse a camera that is given twice: its second image says what the first one does."""
-    for i, camera in enumerate(cameras):
-        if camera in cameras[:i]:
-            names = [name for name, known in CAMERAS.items() if known == camera]
-            which = f"The camera {names[0]!r}" if names else f"The camera at {camera.pos}"
-            raise XResetError(f"{which} is given twice. Give each camera once (--camera).")
+    if (i := first_repeated(cameras)) is not None:
+        camera = cameras[i]
+        names = [name for name, known in CAMERAS.items() if known == camera]
+        which = f"The camera {names[0]!r}" if names else f"The camera at {camera.pos}"
+        raise XResetError(f"{which} is given twice. Give each camera once (--camera).")

@@ -21,6 +21,7 @@ from xreset.demos import hand
 from xreset.demos.archive import SIDES, Demos, merge_demos, one_sequence
 from xreset.demos.grasp import Contacts, Grasp, Solid, fit_hand, handedness, plan_contacts
 from xreset.errors import DemoError
+from xreset.files.checks import first_repeated
 from xreset.files.progress import Progress
 from xreset.geometry.shapes import turn_of
 from xreset.objects.catalogue import load_objects
@@ -80,9 +81,8 @@ def synthetic_demos(
         raise DemoError(f"side is {unknown[0]!r}, expected 'right', 'left' or 'both'.")
     specs = load_objects(names, meshes)
     given = [spec.name for spec in specs]
-    for i, name in enumerate(given):
-        if name in given[:i]:
-            raise DemoError(f"The object {name} is given twice. Name each object once.")
+    if (i := first_repeated(given)) is not None:
+        raise DemoError(f"The object {given[i]} is given twice. Name each object once.")
     parts = []
     for side in sides:
         for spec in specs:

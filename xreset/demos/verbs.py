@@ -18,6 +18,7 @@ from xreset.files.checks import (
     PositiveInt,
     Seed,
     Share,
+    first_repeated,
     frozen,
     obeys_rules,
 )
@@ -239,10 +240,8 @@ def select_demos(
     """
     from xreset.demos.archive import merge_demos, read_demos, write_demos
 
-    places = [Path(file).resolve() for file in files]
-    for i, place in enumerate(places):
-        if place in places[:i]:
-            raise DemoError(f"The archive {files[i]} is given twice. Give each archive once.")
+    if (i := first_repeated([Path(file).resolve() for file in files])) is not None:
+        raise DemoError(f"The archive {files[i]} is given twice. Give each archive once.")
     demos = merge_demos([*map(read_demos, files)])
     inputs = {f"demos {i}": file_hash(file) for i, file in enumerate(files)}
     others = None

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 import types
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import MISSING, dataclass, fields, is_dataclass, make_dataclass
 from difflib import get_close_matches
@@ -207,6 +207,11 @@ def _is_union(hint: Any) -> bool:
 def _parts(hint: Any) -> tuple[Any, ...]:
     """Return the members of a union, or the type itself."""
     return get_args(hint) if _is_union(hint) else (hint,)
+
+
+def first_repeated(values: Sequence[Any]) -> int | None:
+    """Return the index of the first value that equals an earlier one; None: each is given once."""
+    return next((i for i, value in enumerate(values) if value in values[:i]), None)
 
 
 def is_rigid(T: np.ndarray) -> bool:

@@ -122,9 +122,8 @@ def train(
     if num_envs is None:
         num_envs = _WORLDS if teacher is None else _WORLDS_OF_STUDENT
     # before torch is imported and meshes are cut
-    _check_worlds(first, goals, num_envs // (1 + len(others)), config)
-    for bank in others:
-        _check_worlds(bank, None, num_envs // (1 + len(others)), config)
+    for source in (first, *others):
+        _check_worlds(source, goals, num_envs // (1 + len(others)), config)
     from xreset.learning import train as training
     from xreset.policy.onnx_policy import policy_contract
 

@@ -95,9 +95,9 @@ def _serve(
 
     opened = page.Page(shown, host=host, port=port, sequence=sequence, frame=frame)
     number = opened.url.rpartition(":")[2]
-    rows = "frames" if shown.is_motion else shown.kind
     sequences = quantity(len(shown.sequence_name), "sequence")
-    say(f"{sequences}, {quantity(len(shown.frame), rows.removesuffix('s'))} at {opened.url}")
+    row = "frame" if shown.is_motion else shown.kind.removesuffix("s")
+    say(f"{sequences}, {quantity(len(shown.frame), row)} at {opened.url}")
     tunnel = f"ssh -L {number}:localhost:{number} THIS_MACHINE"
     say(f"From another machine: {tunnel}, then open the same address. Ctrl-C ends.")
     server.serve_until_interrupted(opened)

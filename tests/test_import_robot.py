@@ -68,7 +68,7 @@ HAND = _hand(*map(_finger, _PLACES))
 
 ARM = (ROBOTS / "arm.urdf").read_text()
 _MOUNT = """<joint name="mount" type="fixed"><parent link="l5"/><child link="hand_base"/>
-  <origin rpy="0 -1.5708 0"/></joint>"""
+  <origin xyz="0 0 0.055" rpy="0 -1.5708 0"/></joint>"""
 _FINGERS = HAND.replace('"base"', '"hand_base"').partition(">")[2]
 WHOLE = ARM.replace("</robot>", _MOUNT + _FINGERS)
 """Arm and hand in one file."""
@@ -194,7 +194,7 @@ class Toy(Robots):
         spec = load_robot(folder)
         self.assertEqual(spec.home[spec.arm_indices].tolist(), [0.1235] * 6)
         # 15 times the effort are 4500, the most is 2000, and the step of the engines allows this
-        self.assertEqual(spec.joints[0].drive.kp, 1530)
+        self.assertEqual(spec.joints[0].drive.kp, 1560)
         self.assertIn(
             "ok", [finding.level for finding in check(folder) if finding.topic == "drives"]
         )
@@ -604,12 +604,29 @@ class Toy(Robots):
         with self.assertRaisesRegex(RobotError, "absent.urdf. is not a file"):
             self.imported(HAND, arm=self.sources / "absent.urdf")
 
+    def test_the_arms_of_robots_end_where_their_own_hands_begin(self):
+        for robot, flange, end in (
+            ("panda-allegro", "panda_link7", 0.12),  # the link before it is on neither side
+            ("openarm", "link7", 0.108),  # a joint of the arm moves it, across the fingers
+            ("iiwa14-sharpa", "link_7", 0.035),
+        ):
+            made = make_robot(Path(robot), self.hand, self.folder / robot)
+            spec = load_robot(made.folder)
+            joint = load_urdf(spec.urdf).joint("base_fixed")
+            fingers = joint.T_parent_joint[:3, 0]
+            with self.subTest(robot):
+                self.assertEqual(joint.parent, flange)
+                self.assertEqual(len(spec.arm_indices), 7)
+                assert_allclose(joint.T_parent_joint[:3, 3], (0, 0, end), atol=1e-9)
+                assert_allclose(fingers, (0, 0, 1), atol=1e-3)
+                self.assertIn(f"carried by the arm's link '{flange}'", " ".join(made.guessed))
+
     def test_a_hand_whose_root_is_inside_it_is_moved_in_front_of_the_flange(self):
-        """Its palm is along x, from 0 to 80 mm."""
+        """Its palm is along x, from 0 to 80 mm. The shape of the arm's last link ends 55 mm in front of its frame."""
         made = make_robot(self.arm, self.hand, self.folder / "mine", rpy=(0, np.pi / 2, 0))
         T = load_urdf(made.folder / "robot.urdf").joint("hand_base_fixed").T_parent_joint
-        assert_allclose(T[:3, 3], (0, 0, 0.08), atol=1e-9)
-        self.assertIn("80 mm along the flange's z axis", " ".join(made.guessed))
+        assert_allclose(T[:3, 3], (0, 0, 0.135), atol=1e-9)
+        self.assertIn("135 mm along the flange's z axis", " ".join(made.guessed))
 
     def test_fingers_point_out_of_the_arm_whichever_axis_of_the_flange_does(self):
         for rpy, axis in (("-1.5708 0 0", "-y"), ("0.7 0.7 0", "z")):
@@ -633,7 +650,9 @@ class Toy(Robots):
 
     def test_arm_and_hand_in_one_file_are_the_same_robot(self):
         mount = load_urdf(self.sources / "mine" / "robot.urdf").joint("hand_base_fixed")
-        assert_allclose(mount.T_parent_joint[:3, 3], (0, 0, 0), atol=1e-9)
+        assert_allclose(
+            mount.T_parent_joint[:3, 3], (0, 0, 0.055), atol=1e-9, err_msg="the end of l5"
+        )
         self.assertEqual(mount.parent, "l5")
         whole = self.file("whole.urdf", WHOLE)
         said = succeeds("robots", "import", "--hand", whole, "--out", self.folder / "mine")
@@ -660,15 +679,15 @@ class Toy(Robots):
     def test_what_is_no_robot_of_an_arm_and_a_hand_is_named(self):
         bone = _BONE.format(mass=0.03, y=0)
         centered = bone.replace('<collision><origin xyz="0.02 0 0"/>', "<collision>")
-        part = f"""<link name="cam">{centered}<joint name="pan" type="revolute"><parent link="base"/>
-          <child link="cam"/>{_LIMIT}</joint></robot>"""
+        part = f"""<link name="lid">{centered}<joint name="pan" type="revolute"><parent link="base"/>
+          <child link="lid"/>{_LIMIT}</joint></robot>"""
         hand = HAND.replace("</robot>", part)
         twice = HAND.replace('name="f2_2"', 'name="f1_2"')
         still = HAND.replace('name="f1_1" type="revolute"', 'name="f1_1" type="fixed"')
         for text, words in (
             (
                 hand,
-                "tip of 'cam' is at the finger's first joint 'pan'.*If it is no finger, make 'pan'",
+                "tip of 'lid' is at the finger's first joint 'pan'.*If it is no finger, make 'pan'",
             ),
             (twice, "the joint name 'f1_2' occurs twice"),
             (still, "'f1_2' mimics 'f1_1', which is not a moving joint.*Make 'f1_2' fixed"),
@@ -720,6 +739,47 @@ class Toy(Robots):
                 self.assertEqual(len(spec.arm_indices), 7)
                 self.assertNotIn("pan", spec.joint_names)
                 self.assertIn("joints that move no finger are fixed at 0: pan", made.guessed)
+
+    def test_a_camera_that_pans_on_the_hand_is_no_finger(self):
+        tilt = _LIMIT.replace("0 1 0", "1 0 0")
+        for name, bone, is_camera in (
+            ("camera", _BONE.format(mass=0.03, y=0), True),
+            ("head", "</link>", True),  # without a shape it touches nothing
+            ("head", _BONE.format(mass=0.03, y=0), False),
+        ):
+            camera = f"""<link name="{name}_a">{bone}<joint name="pan" type="revolute"><parent link="base"/>
+              <child link="{name}_a"/><origin xyz="0.03 0 0.03"/>{_LIMIT}</joint><link name="{name}">{bone}
+              <joint name="tilt" type="revolute"><parent link="{name}_a"/><child link="{name}"/>{tilt}</joint></robot>"""
+            with self.subTest(name, is_camera=is_camera):
+                hand = self.file("hand.urdf", HAND.replace("</robot>", camera))
+                made = make_robot(self.arm, hand, self.folder / f"{name}{is_camera}")
+                joints = load_robot(made.folder).joint_names
+                self.assertEqual("pan" not in joints and "tilt" not in joints, is_camera)
+                said = "joints that move no finger are fixed at 0: pan, tilt" in made.guessed
+                self.assertEqual(said, is_camera)
+
+    def test_a_camera_that_pans_is_not_the_end_of_an_arm(self):
+        for name, parent, joints in (
+            ("camera", "l5", 2),  # more joints move it than the flange
+            ("camera", "base", 1),
+            ("mast", "base", 2),
+            ("mast", "base", 4),  # perhaps the arm
+        ):
+            above = parent
+            parts = ""
+            for i in range(joints):
+                parts += f"""<link name="{name}{i}">{_BONE.format(mass=0.03, y=0)}<joint name="turn{i}" type="revolute">
+                  <parent link="{above}"/><child link="{name}{i}"/><origin xyz="0.1 0.1 0.1"/>{_LIMIT}</joint>"""
+                above = f"{name}{i}"
+            arm = self.file("arm.urdf", ARM.replace("</robot>", f"{parts}</robot>"))
+            with self.subTest(name, parent=parent, joints=joints):
+                if joints == 4:
+                    words = "ends in l5, mast3. Name the link that carries the hand"
+                    self.assertRaisesRegex(RobotError, words, self.imported, HAND, arm)
+                    continue
+                made = make_robot(arm, self.hand, self.folder / f"{name}{parent}{joints}")
+                self.assertIn("carried by the arm's link 'l5'", " ".join(made.guessed))
+                self.assertEqual(load_robot(made.folder).joint_names, self.spec.joint_names)
 
     def test_impossible_figures_are_replaced_with_a_note(self):
         heavy = HAND.replace(

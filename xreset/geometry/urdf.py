@@ -159,6 +159,14 @@ class RobotTree:
             name = self.above[name].parent
         return name
 
+    def pose_in(self, link: str, name: str) -> np.ndarray:
+        """[4, 4] pose of a link in the frame of another one that carries it, with all joints at 0."""
+        T = np.eye(4)
+        while name != link:
+            T = self.above[name].T_parent_joint @ T
+            name = self.above[name].parent
+        return T
+
 
 def robot_tree(robot: RobotSpec) -> RobotTree:
     """Return the tree of a robot's URDF; the file is read again only after a change.

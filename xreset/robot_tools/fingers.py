@@ -20,7 +20,7 @@ from xreset.geometry.urdf import RobotTree
 from xreset.geometry.urdf_writer import FRAME_MASS, axes, fixed, frame
 from xreset.robot_tools.draft import draft_spec, link_places
 from xreset.robot_tools.opposition import closing_range, opposition
-from xreset.robot_tools.sources import with_fixed, without
+from xreset.robot_tools.sources import ARM_JOINTS, is_camera, with_fixed, without
 from xreset.spec import FingertipSpec, KeypointSpec
 
 _FINGERS = ("index", "middle", "ring", "little")
@@ -54,8 +54,6 @@ _SPREAD = 0.01
 """Spread of the directions of parallel fingers: 1 - length of the mean of the unit vectors."""
 _HANDS_APART = 0.2
 """[m] Distance of the fingers of two hands."""
-_ARM_JOINTS = 3
-"""Joints that move all fingers of a hand but not those of the other one: the hand has an arm of its own."""
 _SHORTEST = 1e-6
 """[m] Length of a finger from which its direction is known."""
 _BEND = 0.15
@@ -172,10 +170,13 @@ class Hand:
     def _joints_of_other_parts(self) -> list[str]:
         """Return the joints that move no finger, such as that of a camera on the arm.
 
-        If chains can meet below one child of the root only, they are the hand, and other chains move no finger. Below a
-        root that is only a frame, chains with a thumb are the hand, too. But if the names of another chain state a
-        finger, or a drive of the hand moves it, nothing is certain: no joint is returned.
+        Chains that :meth:`_cameras` names move no finger. If chains can meet below one child of the root only, they are
+        the hand, and other chains move no finger. Below a root that is only a frame, chains with a thumb are the hand,
+        too. But if the names of another chain state a finger, or a drive of the hand moves it, nothing is certain: no
+        joint is returned.
         """
+        if cameras := self._cameras():
+            return cameras
         hands = []
         for own in self._hands().values():
             has_thumb = any(finger.name == "thumb" for finger in own)
@@ -191,6 +192,25 @@ class Hand:
             if chain.name or drives & self._drives_of(chain):
                 return []
             still += [joint for joint in chain.joints if joint not in still]
+        return still
+
+    def _cameras(self) -> list[str]:
+        """Return the joints of chains that are called cameras or have no shapes, if no name states a finger, and no
+        drive moves a finger as well."""
+        fingers = []
+        others = []
+        for chain in self._chains():
+            bodies = [self.tree.link(name) for name in (*chain.links, *chain.fixed_links)]
+            solid = any(body.collisions for body in bodies)
+            is_finger = bool(chain.name) or (solid and not is_camera(chain.names))
+            (fingers if is_finger else others).append(chain)
+        if len(fingers) < 2:
+            return []
+        drives = set.union(*map(self._drives_of, fingers))
+        still = []
+        for chain in others:
+            if not drives & self._drives_of(chain):
+                still += [joint for joint in chain.joints if joint not in still]
         return still
 
     def _is_scene(self) -> bool:
@@ -235,7 +255,7 @@ class Hand:
             begins.append([self._at[finger.links[len(arm)]][:3, 3] for finger in own])
         gap = min(cdist(a, b).min() for a, b in combinations(begins, 2))
         thumbs = [one for one in self._chains() if one.name == "thumb"]
-        is_one = gap < _HANDS_APART and len(thumbs) < 2 and min(arms) < _ARM_JOINTS
+        is_one = gap < _HANDS_APART and len(thumbs) < 2 and min(arms) < ARM_JOINTS
         if is_one or any(a & b for a, b in combinations(drives, 2)):
             return self.tree
         for child, own in hands.items():

@@ -61,6 +61,8 @@ _STABLE = {"hand": 0.8, "arm": 0.3}
 inertia. With stiffer arms, MuJoCo's steps differ from finer ones by more than its check allows."""
 _HOME_PALM = (0.57, 0.45, 0.25)
 """[m] Position of the palm at home: above the table, looking down, fingers away from the person."""
+_FLUSH = 0.02
+"""[m] A flange's frame that is nearer to the end of the flange's shapes is where the hand begins."""
 _ALONG = 0.9
 """Cosine of the angle to an axis below which fingers do not point along it."""
 
@@ -182,6 +184,8 @@ class _Arm:
     tree: RobotTree
     flange: str
     """Link that carries the hand."""
+    ahead: np.ndarray
+    """[3] the axis of the flange's frame that points out of the arm."""
 
 
 def _read_arm(path: Path, flange: str | None, notes: list[str]) -> _Arm:
@@ -191,12 +195,16 @@ def _read_arm(path: Path, flange: str | None, notes: list[str]) -> _Arm:
         robot = load_robot(path)
         path = robot.urdf
     tree = completed(read_source(path, notes), path, notes)
-    if robot is not None:
-        flange = flange or tree.above[robot.hand_root].parent
     if flange is None:
-        flange = last_link(tree)
+        flange = last_link(tree, None if robot is None else robot.hand_root)
         notes.append(f"the hand is carried by the arm's link {flange!r} (--flange says another)")
-    return _Arm(tree=bare(tree, tree.link(flange).name, notes), flange=flange)
+    arm = bare(tree, tree.link(flange).name, notes)
+    ahead = _out_of_flange(arm, flange)
+    if robot is not None and robot.palm in tree.below(flange):
+        fingers = tree.pose_in(flange, robot.palm)[:3, 0]
+        if np.abs(fingers).max() > _ALONG:
+            ahead = fingers.round() + 0.0
+    return _Arm(tree=arm, flange=flange, ahead=ahead)
 
 
 def _holds_arm(hand: RobotTree, arm: RobotTree) -> bool:
@@ -218,13 +226,13 @@ def _carried(
     notes: list[str],
 ) -> tuple[RobotTree, str]:
     """Return an arm with the hand on its flange, and what only a person can say about the mounting."""
-    ahead = _out_of_flange(arm.tree, arm.flange)
+    ahead = arm.ahead
     sign = "-" if ahead.sum() < 0 else ""
     along = f"the flange's {sign}{'xyz'[int(np.abs(ahead).argmax())]} axis"
     if rpy is None:
         rpy = _guessed_rpy(hand, ahead, along, notes)
     if offset is None:
-        offset = _guessed_offset(hand, rpy, ahead, along, notes)
+        offset = _guessed_offset(hand, arm, rpy, along, notes)
     T_flange_hand = pose(offset, rpy=rpy)
     T_flange_palm = T_flange_hand @ hand.palm
     mounting = (
@@ -239,11 +247,8 @@ def _carried(
 def _out_of_flange(arm: RobotTree, flange: str) -> np.ndarray:
     """[3] the axis of the flange's frame that points out of the arm: along the last joint's axis, away from the link
     before that joint. It is z where the joint turns about none of the flange's axes."""
-    T = np.eye(4)  # pose of the flange in the frame of the link
-    link = flange
-    while link != arm.root and link not in arm.moved_by:
-        T = arm.above[link].T_parent_joint @ T
-        link = arm.above[link].parent
+    link = arm.moving_ancestor(flange)
+    T = arm.pose_in(link, flange)
     joint = arm.moved_by.get(link)
     axis = np.zeros(3) if joint is None else T[:3, :3].T @ joint.axis
     if joint is None or np.abs(axis).max() < _ALONG:
@@ -279,16 +284,27 @@ def _vector(values: np.ndarray) -> str:
 
 
 def _guessed_offset(
-    hand: Hand, rpy: tuple[float, float, float], ahead: np.ndarray, along: str, notes: list[str]
+    hand: Hand,
+    arm: _Arm,
+    rpy: tuple[float, float, float],
+    along: str,
+    notes: list[str],
 ) -> tuple[float, float, float]:
-    """Return the position of the hand's root in the flange's frame where no part of it is behind the flange [m]."""
-    depth = -(hand.body @ pose(rpy=rpy)[:3, :3].T @ ahead)
-    distance = round(float(depth.max(initial=0.0)), 3)
+    """Return the position of the hand's root in the flange's frame where no part of it is behind the flange, or behind
+    the flange's own shapes where these end far in front of its frame [m]."""
+    end = 0.0
+    shapes = arm.tree.link(arm.flange).collisions
+    if shapes:
+        end = float((surface_of(shapes)[0] @ arm.ahead).max())
+    depth = -(hand.body @ pose(rpy=rpy)[:3, :3].T @ arm.ahead)
+    distance = depth.max(initial=0.0) + (end if end > _FLUSH else 0.0)
+    distance = round(float(distance), 3)
     if distance > 0:
         notes.append(
-            f"the hand's root is {1e3 * distance:.0f} mm along {along}, so that its body begins there (--offset)"
+            f"the hand's root is {1e3 * distance:.0f} mm along {along}, so that its body begins where the arm ends "
+            "(--offset)"
         )
-    x, y, z = (distance * ahead).tolist()
+    x, y, z = (distance * arm.ahead).tolist()
     return x, y, z
 
 

@@ -4,6 +4,7 @@ together."""
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -64,6 +65,10 @@ _FLANGES = (
 )
 """Links that carry the tool in the makers' files: UR, ABB and Fanuc (ROS-Industrial), xArm, Panda and FR3, iiwa,
 Kinova."""
+_CAMERA = re.compile(r"camera|realsense|optical|lidar|(?<![a-z])(cam|zed)(?![a-z])")
+"""What the names of a camera's links and joints contain, in lower case."""
+ARM_JOINTS = 3
+"""An arm has at least as many joints more than other things that move."""
 
 
 def read_source(path: str | Path, notes: list[str]) -> RobotTree:
@@ -116,17 +121,38 @@ def _note_urdf(root: Element, tree: RobotTree, notes: list[str]) -> None:
         notes.append(f"left out: damping and friction of joints: {listed(damped)}")
 
 
-def last_link(arm: RobotTree) -> str:
+def is_camera(names: Iterable[str]) -> bool:
+    """Return whether names of links or joints say that they are those of a camera."""
+    return any(_CAMERA.search(name.lower()) for name in names)
+
+
+def last_link(arm: RobotTree, hand_root: str | None = None) -> str:
     """Return the link that carries the hand: one that makers of arms call so, or the arm's last link.
+
+    Args:
+        arm: the arm, or a robot.
+        hand_root: link with which the robot's own hand begins. Its parent is the last link, or itself where a joint of
+            the arm moves it.
 
     Raises:
         RobotError: the last one is not unique.
     """
+    if hand_root is not None:
+        carriers = [link for link in arm.link_names if hand_root in arm.below(link)[1:]]
+        last = hand_root if hand_root in arm.moved_by else carriers[-1]
+        known = [link for link in carriers if link in _FLANGES]
+        return known[-1] if known else last
     known = [link for link in arm.link_names if link in _FLANGES]
     if known:
         return known[-1]
+    cameras = [link for link, joint in arm.above.items() if is_camera((link, joint.name))]
+    arm = without(arm, cameras)
     parents = {joint.parent for joint in arm.joints}
     ends = [link for link in arm.link_names if link not in parents]
+    joints = {}
+    for end in ends:
+        joints[end] = sum(end in arm.below(link) for link in arm.moved_by)
+    ends = [end for end in ends if joints[end] > max(joints.values()) - ARM_JOINTS]
     if len(ends) > 1:
         raise RobotError(
             f"the arm ends in {', '.join(ends)}. Name the link that carries the hand with --flange."

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from xreset.errors import PolicyError
 from xreset.files.checks import Checked, Seed, frozen, obeys_rules
 from xreset.files.text import Brief, shown
-from xreset.geometry.description import load_robot
+from xreset.geometry.description import load_robot, robot_of_file
 from xreset.learning.exported import PolicyFile, find_policy
 from xreset.live.deploy import deployed_graph, is_deployed, made_for, training_of
 from xreset.objects.catalogue import object_names
@@ -216,7 +216,9 @@ def load_policy(policy: str | Path | PolicySpec, *, robot: str | Path | None = N
     run = found.run
     is_graph = is_deployed(found.content)
     contract, start = _opened_graph(found) if is_graph else _opened(found)
-    spec = load_robot(robot or (run.robot if run else contract.robot))
+    if robot is None:
+        robot = run.robot if run else robot_of_file(found.path, contract.robot)
+    spec = load_robot(robot)
     if not is_graph:
         check_robot_of(str(found.path), contract, spec)
     elif contract.joint_names != spec.joint_names:

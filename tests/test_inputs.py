@@ -1,6 +1,7 @@
 """Loading of demonstrations, motion and banks, with the robot and the objects that they need."""
 
 import pickle
+import shutil
 from dataclasses import replace
 from unittest.mock import patch
 
@@ -14,6 +15,7 @@ from xreset import (
     Retargeted,
     evaluate,
     load_object,
+    load_robot,
     make_bank,
     make_env,
     make_goals,
@@ -25,9 +27,10 @@ from xreset import (
     write_demos,
     write_retargeted,
 )
-from xreset.errors import DemoError, FileFormatError, XResetError
+from xreset.errors import DemoError, FileFormatError, RobotError, XResetError
 from xreset.files.storage import file_hash
 from xreset.resets.bank import check_objects, starts_and_goals
+from xreset.resets.config import GoalConfig
 from xreset.resets.inputs import load_inputs
 from xreset.retarget.file import object_sources
 
@@ -97,6 +100,33 @@ class InputsTest(InOneFolder):
             write_retargeted(file, motion, config={"meshes": wrong}, inputs=inputs)
             with refuses(self, "--meshes", XResetError, wrong):
                 load_inputs(file)
+
+    def test_the_folder_of_a_robot_is_found_from_any_working_directory(self):
+        folder = self.folder / "work"
+        mine = folder / "robots" / "mine"
+        shutil.copytree(self.robot.urdf.parent, mine)
+        text = (mine / "robot.toml").read_text()
+        (mine / "robot.toml").write_text(text.replace('name = "ur7e-sharpa"', 'name = "mine"'))
+        robot = load_robot(mine)
+        (folder / "runs" / "mine").mkdir(parents=True)  # is no robot
+        motion = folder / "runs" / "motion.npz"
+        write_retargeted(
+            motion, toy_retargeted(robot, [SOUP], [0, 2]), config={"robot": "robots/mine"}
+        )
+        bank = folder / "runs" / "resets.npz"
+        make_bank(motion, out=bank)
+        goals = folder / "runs" / "goals.npz"
+        make_goals([SOUP], robot=mine, families="lift", config=GoalConfig(per_family=1), out=goals)
+        for file in (motion, bank, goals):
+            self.assertEqual(load_inputs(file).robot.urdf, robot.urdf, file.name)
+        write_bank(bank, toy_bank(robot))
+        shutil.move(mine, folder)
+        for file in (motion, bank):  # from where the folder has the robot's name
+            self.assertEqual(load_inputs(file).robot_name, str(folder / "mine"), file.name)
+        shutil.move(folder / "mine", folder / "gone")
+        words = "Unknown robot 'mine', and no folder has that name.*give the robot's folder"
+        with self.assertRaisesRegex(RobotError, words):
+            load_inputs(bank)
 
     def test_what_does_not_fit_is_refused(self):
         with self.assertRaisesRegex(FileFormatError, "for the robot 'ur7e-sharpa'"):

@@ -156,6 +156,11 @@ class TrainingTest(WithBank):
             info = read_run(moved)
             expected = ("openarm", str(self.bank.resolve()), found)
             self.assertEqual((info.robot, info.resets, info.meshes), expected)
+        self.changed_run(moved, robot="moved")  # the run has the robot's name
+        robot = self.folder / "moved" / "robot.toml"
+        robot.parent.mkdir()
+        robot.touch()
+        self.assertEqual(read_run(moved).robot, str(robot.parent.resolve()))
 
     def test_goals_need_no_demonstrations(self):
         """Every episode begins at home; fine-tuning continues with the run's networks and configuration; a bank keeps its

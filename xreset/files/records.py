@@ -10,7 +10,6 @@ from __future__ import annotations
 import errno
 import json
 import math
-import os
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -30,6 +29,7 @@ from xreset.files.storage import (
     code_version,
     max_bytes,
     must_exist,
+    stated_path,
 )
 from xreset.files.text import is_plain, plain, shown
 
@@ -407,13 +407,20 @@ def stated_doubts(path: str | Path) -> list[str]:
 
 
 def stated_meshes(path: str | Path) -> Path | None:
-    """Return the folder of meshes that a file was made with, if the file states one that is still there. The folder may
-    be relative to one of the folders above the file."""
+    """Return the folder of meshes that a file was made with, if the file states one that is still there; see
+    :func:`stated_path`."""
     folder = _stated(path, "meshes")
     if not folder or not isinstance(folder, str):
         return None
-    places = [Path(), *Path(path).resolve().parents]
-    return next((place / folder for place in places if os.path.isdir(place / folder)), None)
+    found = stated_path(folder, path)
+    return None if found is None else Path(found)
+
+
+def stated_robot(path: str | Path) -> str | None:
+    """Return the name or folder of the robot that a file was made with, as it was given; None if the file does not
+    state it."""
+    robot = _stated(path, "robot")
+    return robot if isinstance(robot, str) else None
 
 
 def _stated(path: str | Path, name: str) -> Any:

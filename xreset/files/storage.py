@@ -397,6 +397,17 @@ def file_hash(path: str | Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
+def stated_path(stated: str, file: str | Path, content: str = "") -> str | None:
+    """Return a file or folder that another file states, or None if it is gone. It may be relative to the working folder
+    or to one of the folders above that file. ``content``: what a folder must have."""
+    if os.path.exists(os.path.join(stated, content)):
+        return stated
+    for place in Path(file).resolve().parents:
+        if os.path.exists(place / stated / content):
+            return str(place / stated)
+    return None
+
+
 def must_exist(path: Path, what: str) -> None:
     """Refuse, with ``FileFormatError``, a path where no regular file is, or one that may not be read; ``what`` it ought
     to be is for the message."""

@@ -25,11 +25,11 @@ from xreset.files.checks import (
     from_dict,
     frozen,
 )
-from xreset.files.storage import read_json, write_json
+from xreset.files.storage import read_json, stated_path, write_json
 from xreset.files.text import shown
+from xreset.geometry.description import robot_of_file
 from xreset.learning.clock import Lift, read_lift
 from xreset.learning.config import TrainConfig
-from xreset.physics.plugins import robot_names
 from xreset.task.contract import Contract
 
 SCHEMA = "xreset-run/1"
@@ -133,12 +133,11 @@ def read_run(folder: str | Path, *, as_stated: bool = False) -> RunInfo:
 
 def _with_paths(data: T, folder: Path) -> T:
     """Return a run's description with the paths as they are from here."""
-    found = {}
-    for name in ("robot", "resets", "meshes"):
+    found = {"robot": robot_of_file(folder, data.robot)}
+    for name in ("resets", "meshes"):
         path = getattr(data, name)
-        if path and path not in robot_names() and not os.path.exists(path):
-            places = (above / path for above in folder.resolve().parents)
-            found[name] = str(next(filter(os.path.exists, places), path))
+        if path:
+            found[name] = stated_path(path, folder) or path
     return replace(data, **found)
 
 

@@ -149,11 +149,14 @@ def write_goals(
     goals: GoalSet,
     config: GoalConfig | None = None,
     *,
+    robot: str | Path | None = None,
     meshes: str | Path | None = None,
 ) -> None:
-    """Write a goal set, how it was drawn, and the folder of the objects' meshes; see
+    """Write a goal set, how it was drawn, the name or folder of the robot, and the folder of the objects' meshes; see
     :func:`xreset.files.records.write_record`."""
-    made_with = (asdict(config) if config else {}) | {"meshes": str(meshes) if meshes else None}
+    made_with = asdict(config) if config else {}
+    made_with["robot"] = str(robot or goals.robot)
+    made_with["meshes"] = str(meshes) if meshes else None
     write_record(GoalSet, path, SCHEMA, goals, check=bank_problem, config=made_with)
 
 

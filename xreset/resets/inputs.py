@@ -14,10 +14,10 @@ from xreset.demos.archive import Demos, demo_objects, read_demos, rest_on_table
 from xreset.errors import DemoError, FileFormatError, XResetError
 from xreset.files.checks import frozen
 from xreset.files.progress import Progress, unseen
-from xreset.files.records import npz_schema, stated_meshes
+from xreset.files.records import npz_schema, stated_meshes, stated_robot
 from xreset.files.storage import file_hash
 from xreset.files.text import shown
-from xreset.geometry.description import load_robot
+from xreset.geometry.description import load_robot, robot_of_file
 from xreset.objects.catalogue import canonical_names, load_objects, object_source
 from xreset.resets.bank import SCHEMA as BANK
 from xreset.resets.bank import (
@@ -163,6 +163,8 @@ def load_inputs(
             stated = stated_sources(data)
         elif path is not None:
             stated = object_sources(path)
+        if robot is None and path is not None:
+            robot = robot_of_file(path, stated_robot(path) or data.robot, data.robot)
         robot = robot or data.robot
         if objects is None:
             # before meshes are cut, which takes minutes

@@ -131,6 +131,7 @@ def make_bank(
             "closing": asdict(closing),
             "squeeze": asdict(squeeze),
             "transfer": asdict(transfer),
+            "robot": inputs.robot_name,
             "meshes": str(inputs.meshes) if inputs.meshes else None,
             "doubts": doubts,
         }
@@ -177,9 +178,8 @@ def make_goals(
     from xreset.resets.goals import drawn_goals, write_goals
 
     config = config or GoalConfig()
-    found = drawn_goals(
-        load_objects(names, meshes), load_robot(robot), families, poses, config, progress
-    )
+    spec = load_robot(robot)
+    found = drawn_goals(load_objects(names, meshes), spec, families, poses, config, progress)
     if out is not None:
-        write_goals(out, found, config, meshes=meshes)
+        write_goals(out, found, config, robot=spec.name if spec is robot else robot, meshes=meshes)
     return found

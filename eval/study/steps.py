@@ -261,47 +261,52 @@ def eval_todo(run: Run, folder: Path, spec: Evaluation, subset: Subset, engines:
     if policy is None:
         files["policy"] = run.folder / "policy.onnx"
     trained = (run.config or TrainConfig()).task.termination.episode_seconds
-    missing = []
-    for engine in engines:
-        if not is_evaluated(
-            folder / f"{engine}.json",
-            files,
-            seed=spec.seed,
-            episodes=spec.episodes,
-            seconds=spec.episode_seconds,
-            trained=trained,
-        ):
-            missing.append(engine)
-            command += ["--engine", engine]
+    missing = engines_left(
+        folder,
+        engines,
+        files,
+        seed=spec.seed,
+        episodes=spec.episodes,
+        seconds=spec.episode_seconds,
+        trained=trained,
+    )
+    command += [f"--engine={engine}" for engine in missing]
     return (f"in {', '.join(missing)}", [command]) if missing else ("", [])
 
 
-def is_evaluated(
-    result: Path,
+def engines_left(
+    folder: Path,
+    engines: Sequence[str],
     files: Mapping[str, Path],
     *,
     seed: int,
     episodes: int,
     seconds: float | None = None,
     trained: float,
-) -> bool:
-    """Return whether an engine's results are those of certain episodes and files.
+) -> list[str]:
+    """Return the engines without results of certain episodes and files.
 
     Args:
-        result: file of the engine's results.
+        folder: folder of the results.
+        engines: names of the engines.
         files: the files as they are now, by their name in the results; those that do not exist are not compared.
         seed: seed of the starts.
         episodes: episodes of each demonstration.
         seconds: length of an episode [s]; None: as in the policy's training.
         trained: length of an episode in the policy's training [s]; results may not state theirs.
     """
-    if not result.is_file():
-        return False
-    found = read_result(result)
     hashes = {name: file_hash(file) for name, file in files.items() if file.is_file()}
-    played = (found.seed, found.episodes_per_demo, found.episode_seconds or trained)
-    is_same = played == (seed, episodes, seconds or trained)
-    return is_same and hashes.items() <= found.inputs.items()
+    left = []
+    for engine in engines:
+        result = folder / f"{engine}.json"
+        if result.is_file():
+            found = read_result(result)
+            played = (found.seed, found.episodes_per_demo, found.episode_seconds or trained)
+            is_same = played == (seed, episodes, seconds or trained)
+            if is_same and hashes.items() <= found.inputs.items():
+                continue
+        left.append(engine)
+    return left
 
 
 def _as_options(changes: dict[str, Any], config: Any) -> dict[str, Any]:

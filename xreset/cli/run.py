@@ -68,7 +68,7 @@ def run(
         XResetError: a step fails, or a file in the folder was made from others.
     """
     from xreset.demos.archive import read_demos
-    from xreset.eval.study import steps
+    from xreset.eval.study.steps import engines_left
     from xreset.geometry.description import load_robot
     from xreset.learning.recipes import starting_config
     from xreset.learning.verbs import ENGINE
@@ -116,13 +116,11 @@ def run(
     )
     files = {"demos": demos, "policy": out / "policy.onnx"}
     trained = task.termination.episode_seconds
-    missing = []
-    for name in engines:
-        result = out / "eval" / f"{name}.json"
-        if not steps.is_evaluated(result, files, seed=seed, episodes=episodes, trained=trained):
-            missing.append(name)
-    if missing:
-        _step("eval", out, demos=demos, episodes=episodes, seed=seed, meshes=meshes, engine=missing)
+    results = out / "eval"
+    left = engines_left(results, engines, files, seed=seed, episodes=episodes, trained=trained)
+    if left:
+        named = [f"--engine={name}" for name in left]
+        _step("eval", out, *named, demos=demos, episodes=episodes, seed=seed, meshes=meshes)
     _step("report", out, meshes=meshes)
 
 
@@ -178,17 +176,10 @@ _NAMES = {"demos": "archive of demonstrations", "retargeted": "motion"}
 
 
 def _step(verb: str, *words: object, **options: object) -> None:
-    """Print a command of ``xreset``, and run it. Options without a value are left out, lists are repeated."""
-    command = [verb, *map(str, words)]
-    for name, value in options.items():
-        flag = f"--{name.replace('_', '-')}"
-        if isinstance(value, list):
-            for each in value:
-                command += [flag, str(each)]
-        elif value is True:
-            command.append(flag)
-        elif value is not None:
-            command += [flag, str(value)]
+    """Print a command of ``xreset``, and run it. Options without a value are left out."""
+    from xreset.eval.study.steps import flags
+
+    command = [verb, *map(str, words), *flags(options)]
     console.print(f"\n+ xreset {shlex.join(command)}", style="bold")
     perform(command)
 

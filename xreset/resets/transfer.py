@@ -120,7 +120,7 @@ def add_transfers(
     grasps = _grasps(bank, retargeted, robot)
     if not len(grasps):
         return bank
-    poses = _raised_poses(retargeted, _POSES)
+    poses = _raised_poses(retargeted)
     pose, grasp = _candidates(bank, grasps, poses)
     used = objects_named(objects, bank.object_name[grasp])
     scene = SceneSpec(robot=robot, objects=tuple(used.values()))
@@ -143,7 +143,7 @@ def add_transfers(
             grasp[tried],
             poses,
             pose[tried],
-            (robot, scene),
+            scene,
             num_envs=num_envs,
             device=device,
             progress=lambda part, before=before, share=share: progress(before + share * part, work),
@@ -167,7 +167,7 @@ def _holding(
     grasp: np.ndarray,
     poses: _Poses,
     pose: np.ndarray,
-    robot_and_scene: tuple[RobotSpec, SceneSpec],
+    scene: SceneSpec,
     *,
     num_envs: int,
     device: str,
@@ -179,15 +179,14 @@ def _holding(
         The states in which the arm reaches the grasp, the robot is not deep in the object and the hand holds it in
         every engine; their candidates, ascending; and how deep the robot is in the object [m].
     """
-    robot, scene = robot_and_scene
     count = len(grasp)
     steps = 1 + len(bank.engines)
     states, is_reached = _carried(
-        bank, grasp, poses, pose, robot, lambda done: progress(done / count / steps)
+        bank, grasp, poses, pose, scene.robot, lambda done: progress(done / count / steps)
     )
     held = np.flatnonzero(is_reached)
     depth = np.full(count, np.inf)
-    depth[held] = _depth(robot, scene.objects, bank.object_name[grasp[held]], states[held])
+    depth[held] = _depth(scene, bank.object_name[grasp[held]], states[held])
     held = np.flatnonzero(depth <= _THRESHOLDS.object_depth)
     for number, engine in enumerate(bank.engines, start=1):
         if not len(held):
@@ -227,24 +226,25 @@ def _grasps(bank: ResetBank, retargeted: Retargeted, robot: RobotSpec) -> np.nda
     return np.flatnonzero(carried(bank, robot, start_pos[:, 2]))
 
 
-def _raised_poses(retargeted: Retargeted, count: int) -> _Poses:
-    """Return at most ``count`` poses of every demonstration, evenly spread over the frames in which the object is
-    raised. With two or more, the last one is the goal if the object is raised there."""
+def _raised_poses(retargeted: Retargeted) -> _Poses:
+    """Return some poses of every demonstration, evenly spread over the frames in which the object is raised. The last
+    one is the goal if the object is raised there."""
     sequence = []
     frame = []
     start_pos, _ = retargeted.start_pose
     for number, start in enumerate(start_pos):
         height = retargeted.object_pos[retargeted.frames(number), 2] - start[2]
         raised = np.flatnonzero(height > _RAISED)
-        spread = np.linspace(0, len(raised) - 1, min(count, len(raised)))
+        spread = np.linspace(0, len(raised) - 1, min(_POSES, len(raised)))
         chosen = raised[spread.astype(int)]
         sequence += [number] * len(chosen)
         frame += chosen.tolist()
     own = np.array(sequence, dtype=int)
-    rows = retargeted.frame_offsets[own] + np.array(frame, dtype=int)
+    within = np.array(frame, dtype=int)
+    rows = retargeted.frame_offsets[own] + within
     return _Poses(
         sequence=own,
-        frame=np.array(frame, dtype=int),
+        frame=within,
         pos=retargeted.object_pos[rows],
         quat=retargeted.object_quat_wxyz[rows],
     )
@@ -314,12 +314,11 @@ def _carried(
     return State.at_rest(*map(torch.as_tensor, arrays)), is_reached
 
 
-def _depth(
-    robot: RobotSpec, objects: Sequence[ObjectSpec], object_name: np.ndarray, states: State
-) -> np.ndarray:
+def _depth(scene: SceneSpec, object_name: np.ndarray, states: State) -> np.ndarray:
     """[M] depth of the robot in the object of states [m]."""
     poses = (states.joint_pos, states.object_pos, states.object_quat)
-    return object_depth(robot, objects, object_name, *(tensor.numpy() for tensor in poses))
+    arrays = [tensor.numpy() for tensor in poses]
+    return object_depth(scene.robot, scene.objects, object_name, *arrays)
 
 
 def _is_held(backend: Backend, start: State) -> Tensor:

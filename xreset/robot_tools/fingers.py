@@ -327,7 +327,7 @@ class Hand:
         known = "; ".join(links)
         unnamed = [one for one in chains if not one.name]
         if thumb is not None:
-            marked = [one for one in chains if thumb in (*one.links, *one.joints, *one.fixed_links)]
+            marked = [one for one in chains if thumb in one.names]
             if len(marked) != 1:
                 raise RobotError(
                     f"--thumb {thumb!r} is in {len(marked)} fingers; their links are {known}."

@@ -226,8 +226,8 @@ class SelfCollisionTest(TestCase):
         poses = kinematics.link_poses(
             torch.as_tensor(self.home_and(("right_index_MCP_AA", 0.35)))
         ).numpy()
-        clearance = collision.clearance(poses, 0.01)
-        self.assertGreaterEqual(clearance[0], 0.0)
+        clearance = collision.clearance(poses)
+        self.assertEqual(clearance[0], 0.0)
         self.assertLess(clearance[1], -0.002)
         near = collision.near(poses, 0.0)
         for configuration, a, b in near:
@@ -239,8 +239,8 @@ class SelfCollisionTest(TestCase):
         collision = SelfCollision(kinematics)
         few = kinematics.link_poses(torch.as_tensor(self.home_and(("right_index_MCP_AA", 0.35))))
         many = few[[0] * 600 + [1]].numpy()
-        expected = collision.clearance(few.numpy(), 0.01)
-        assert_array_equal(collision.clearance(many, 0.01), expected[[0] * 600 + [1]])
+        expected = collision.clearance(few.numpy())
+        assert_array_equal(collision.clearance(many), expected[[0] * 600 + [1]])
 
     def test_pairs_that_the_arm_moves_join_hand_and_arm(self):
         collision = SelfCollision(Kinematics(self.robot), moved_by_arm=True)

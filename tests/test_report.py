@@ -35,7 +35,6 @@ from xreset.eval.report.clips import (
 )
 from xreset.eval.report.curves import draw_training
 from xreset.eval.report.goals import goal_distances
-from xreset.eval.report.groups import singles
 from xreset.eval.report.make import collect, count_failures, headline, page
 from xreset.eval.report.read import read_trainings
 from xreset.eval.results import read_evaluation, recorded, write_result
@@ -107,7 +106,7 @@ class Outline(HTMLParser):
 
 class CollectTest(Reported):
     def read(self):
-        return read_trainings([str(self.folder)])
+        return read_trainings([self.folder])
 
     def collect(self):
         return collect(self.read())
@@ -360,7 +359,7 @@ class ClipTest(Reported):
             mock.patch("xreset.eval.report.clips.encode_mp4") as encode,
         ):
             encode.return_value = b"film"
-            (training,) = read_trainings([str(self.folder)])
+            (training,) = read_trainings([self.folder])
             objects = make_film([training], self.folder / "film.mp4")
         frames, fps = encode.call_args.args
         names = tuple(sorted({trace.object for trace in rollouts.traces}))
@@ -376,7 +375,7 @@ class ClipTest(Reported):
             robot = load_robot(name)
             rollouts = toy_rollouts(np.array(robot.home))
             self.write_results(name, rollouts, joints=robot.joint_names, robot=name)
-            folders.append(str(self.folder / name))
+            folders.append(self.folder / name)
         clips, strips = draw_report(read_trainings(folders), None, None)
         runs = [clip.episode.run for clip in clips]
         self.assertEqual((runs, strips), (["openarm", "ur7e-robotiq"], []))
@@ -419,8 +418,8 @@ class FailureTest(Reported):
 class PlotTest(Reported):
     def test_a_drawing_takes_the_pages_colour_and_size(self):
         self.write(("mujoco",))
-        (training,) = read_trainings([str(self.folder)])
-        groups = singles([replace(training, curves=CURVES)])
+        (training,) = read_trainings([self.folder])
+        groups = {"run": [replace(training, curves=CURVES)]}
         drawing = draw_training(groups, "iterations")
         self.assertTrue(drawing.startswith("<svg") and drawing.endswith("</svg>"))
         opening = drawing[: drawing.index(">")]
@@ -448,14 +447,14 @@ class PageTest(Reported):
 
     def report(self, **changes):
         """The report of the folder, with films; ``changes`` replace its fields."""
-        report = collect(read_trainings([str(self.folder)]))
+        report = collect(read_trainings([self.folder]))
         return replace(report, clips=self.clips, strips=self.strips, **changes)
 
     def whole(self):
         """The report of a run with results and learning curves."""
         self.write()
         self.write_soup()
-        (training,) = read_trainings([str(self.folder)])
+        (training,) = read_trainings([self.folder])
         report = collect([replace(training, curves=CURVES)])
         return replace(report, clips=self.clips, strips=self.strips)
 
@@ -515,7 +514,7 @@ class PageTest(Reported):
         self.assertIn(words, page(self.report()))
 
     def without_films(self):
-        return collect(read_trainings([str(self.folder)]))
+        return collect(read_trainings([self.folder]))
 
     def test_without_clips_curves_and_run(self):
         self.write(engines=("pybullet",), episode_seconds=12.0)
@@ -551,7 +550,7 @@ class PageTest(Reported):
             self.write((engine,), rollouts_with(*[mean] * 4))
         self.write_soup()
         self.assertEqual(
-            headline(read_trainings([str(self.folder)])),
+            headline(read_trainings([self.folder])),
             "Task progress is 90% in mujoco-warp, 50% in sapien, 40% in mujoco, 10% in pybullet. "
             "The policy was trained in mujoco-warp.",
         )
@@ -568,7 +567,7 @@ class SeveralTest(Reported):
                 joints=robot.joint_names,
                 robot="openarm",
             )
-        runs = [str(self.folder / name) for name in ("a", "b")]
+        runs = [self.folder / name for name in ("a", "b")]
         report = make_report(runs, self.folder / "both")
         self.assertEqual([clip.episode.run for clip in report.clips], ["a", "b"])
         self.assertEqual({clip.episode.engine for clip in report.clips}, {"mujoco"})
@@ -597,7 +596,7 @@ class CommandTest(Reported):
 
     def test_numbers_are_reported_even_where_no_clip_can_be_drawn(self):
         self.write(("mujoco",), robot="a-robot-that-is-not-installed")
-        report = make_report(str(self.folder), self.folder / "elsewhere")
+        report = make_report(self.folder, self.folder / "elsewhere")
         self.assertRegex(
             " ".join(report.notes), "no films: Unknown robot 'a-robot-that-is-not-installed'"
         )

@@ -384,14 +384,6 @@ def check_robot(path: str | Path, what: str, data: Any, robot: RobotSpec) -> Non
         )
 
 
-def check_joints(what: str, data: Any, robot: RobotSpec) -> None:
-    """Refuse data with other joints than the robot's; ``FileFormatError``."""
-    if data.joint_names != robot.joint_names:
-        raise FileFormatError(
-            f"{what} for the robot {data.robot!r}, whose joints are not those of {robot.name!r}. Use one robot."
-        )
-
-
 def objects_named(objects: Sequence[ObjectSpec], names: Iterable[str]) -> dict[str, ObjectSpec]:
     """Return the objects with these names, sorted by name; ``DemoError`` lists the missing ones."""
     given = {spec.name: spec for spec in objects}

@@ -58,10 +58,7 @@ def _about_teacher(training: Training) -> list[str]:
     """Return what a student misses of its teacher's episodes, or how to make the teacher's results."""
     folder = training.folder
     taught = read_evaluation(folder / "teacher")
-    missed = ""
-    if taught:
-        missed = missed_by_student(training.episodes, taught.to_frame())
-    if missed:
+    if taught and (missed := missed_by_student(training.episodes, taught.to_frame())):
         return [missed]
     if training.run is None or training.run.teacher is None:
         return []

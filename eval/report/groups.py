@@ -40,7 +40,7 @@ def grouped(trainings: Sequence[Training]) -> tuple[Groups, list[str]]:
             found.append(members)
             notes += reasons
         elif reasons:
-            found += singles(members).values()
+            found += [[member] for member in members]
             names = ", ".join(m.label for m in members)
             notes.append(f"{names} have the same configuration and are not grouped. {reasons[0]}")
         else:
@@ -49,11 +49,6 @@ def grouped(trainings: Sequence[Training]) -> tuple[Groups, list[str]]:
     if len(groups) < len(found):  # shortened names may be equal
         groups = {_whole_label(members): members for members in found}
     return groups, notes
-
-
-def singles(trainings: Sequence[Training]) -> Groups:
-    """Return a group for each training."""
-    return {training.label: [training] for training in trainings}
 
 
 def _whole_label(members: Sequence[Training]) -> str:

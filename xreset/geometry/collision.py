@@ -230,10 +230,10 @@ class SelfCollision:
                     found[key] = min(distance, found.get(key, margin))
         return found
 
-    def clearance(self, link_poses: np.ndarray, margin: float) -> np.ndarray:
-        """[B] smallest signed distance between two shapes, at most ``margin``; arguments as in :meth:`near`."""
-        clearance = np.full(len(link_poses), margin)
-        for (configuration, _, _), distance in self.near(link_poses, margin).items():
+    def clearance(self, link_poses: np.ndarray) -> np.ndarray:
+        """[B] smallest signed distance between two shapes, at most 0; poses as in :meth:`near`."""
+        clearance = np.zeros(len(link_poses))
+        for (configuration, _, _), distance in self.near(link_poses, 0.0).items():
             clearance[configuration] = min(clearance[configuration], distance)
         return clearance
 

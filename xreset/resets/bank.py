@@ -37,7 +37,7 @@ from xreset.files.records import (
 from xreset.files.text import Brief, shown
 from xreset.retarget.accounts import Account, accounts
 from xreset.retarget.file import JointNames, ReasonNames
-from xreset.spec import ObjectSpec, RobotSpec, check_joints, check_robot
+from xreset.spec import ObjectSpec, RobotSpec, check_robot
 
 SCHEMA = "xreset-resets/1"
 
@@ -241,9 +241,14 @@ def check_states(bank: ResetBank, robot: RobotSpec, objects: tuple[ObjectSpec, .
     """Refuse a bank whose states have other joints or other object geometry; ``FileFormatError``."""
     if not isinstance(bank, ResetBank):
         raise XResetError(f"bank is {shown(bank)}, expected a ResetBank: xreset.read_bank(FILE).")
-    if bank.num_states:
-        check_joints("The reset bank is", bank, robot)
-        check_objects("The reset bank", bank, objects)
+    if not bank.num_states:
+        return
+    if bank.joint_names != robot.joint_names:
+        raise FileFormatError(
+            f"The reset bank is for the robot {bank.robot!r}, whose joints are not those of {robot.name!r}. Use one "
+            "robot."
+        )
+    check_objects("The reset bank", bank, objects)
 
 
 _SAME = 0.1

@@ -118,7 +118,8 @@ def grasps_of_bank(bank: ResetBank, robot: RobotSpec, name: str) -> Grasps:
         retreat=root.new_zeros(len(root), 3),
         missing="no grasp",
     )
-    return found[_shuffled(len(rows))[:_MOST]]
+    shuffled = torch.randperm(len(rows), generator=torch.Generator().manual_seed(0))
+    return found[shuffled[:_MOST]]
 
 
 @one_thread()
@@ -347,7 +348,3 @@ def _poses(pos: np.ndarray, quat: np.ndarray) -> Tensor:
     """[N, 4, 4] poses of positions [N, 3] and quaternions [N, 4]."""
     turn = quat_to_matrix(torch.as_tensor(quat, dtype=torch.float64))
     return homogeneous(turn, torch.as_tensor(pos, dtype=torch.float64))
-
-
-def _shuffled(count: int) -> Tensor:
-    return torch.randperm(count, generator=torch.Generator().manual_seed(0))

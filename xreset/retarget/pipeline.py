@@ -80,16 +80,16 @@ def follow(
         wrist_error=np.full(count, np.inf),
         object_depth=np.full(count, np.inf),
     )
-    batches = list(hands.batches(lambda done, count: progress(done / 2, count)))
+    batches = list(hands.batches(lambda done, total: progress(done / 2, total)))
     paths = [_arm_targets(hands.model, arm, batch.targets, batch.motion) for batch in batches]
     followed = track_each(robot, paths, _THRESHOLDS, config.arm)
-    count = sum(len(path.annotated) for path in paths)
-    done = count / 2
+    total = sum(len(path.annotated) for path in paths)
+    done = total / 2
     for batch, path, (joints, measures) in zip(batches, paths, followed, strict=True):
         rows = batch.rows
         is_frame = batch.is_frame
         done += len(path.annotated) / 2
-        progress(done, count)
+        progress(done, total)
         frames.joint_pos[rows] = arm.full(joints, path.hand_joints)[is_frame]
         frames.root_pos[rows] = path.root_pos[is_frame]
         frames.root_quat[rows] = path.root_quat[is_frame]

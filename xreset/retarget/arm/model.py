@@ -171,9 +171,7 @@ class ArmModel:
     def hand_clearance(self, hand_joints: Tensor) -> Tensor:
         """[...] smallest signed distance between the hand's shapes that can collide in physics, at most 0 [m]."""
         poses = self.hand.link_poses(hand_joints.flatten(0, -2)).numpy()
-        return torch.as_tensor(self._hand_collision.clearance(poses, 0.0)).view(
-            hand_joints.shape[:-1]
-        )
+        return torch.as_tensor(self._hand_collision.clearance(poses)).view(hand_joints.shape[:-1])
 
     def problem(
         self, targets: ArmTargets, thresholds: Thresholds, config: ArmSearch | None = None
@@ -221,7 +219,7 @@ class ArmProblem(ArmTargets):
         height = poses.new_full((len(poses),), _SEARCH).scatter_reduce(
             0, low.frame, low.height, "amin"
         )
-        clearance = torch.as_tensor(model.arm_collision.clearance(poses.numpy(), 0.0)).view(shape)
+        clearance = torch.as_tensor(model.arm_collision.clearance(poses.numpy())).view(shape)
         root = carriers[:, 0]
         at_limit = (joints <= model.lower + _AT_LIMIT) | (joints >= model.upper - _AT_LIMIT)
         return Measures(

@@ -40,6 +40,8 @@ from xreset.task.config import ResetConfig, TaskConfig, TerminationConfig
 
 STEPS = 1024
 """Environment steps of an iteration."""
+_ENDS = TerminationConfig(episode_seconds=2.5)
+SHORT = TrainConfig(task=replace(TrainConfig().task, termination=_ENDS))
 
 
 def reset_config(**options):
@@ -86,7 +88,7 @@ class Compared(InFolder):
 
     def compare(self, *names, **options):
         """The text of a page without curves and films, whose cells end with a bar; ``self.report`` is what it shows."""
-        trainings = read_trainings([str(self.folder / name) for name in names])
+        trainings = read_trainings([self.folder / name for name in names])
         with mock.patch("xreset.eval.report.make.draw_training", return_value=""):
             self.report = collect(trainings, **options)
         return text_of(page(self.report))
@@ -140,7 +142,7 @@ class ReadTest(Compared):
             with refuses(self, message, FileFormatError):
                 read_training(a)
             (a / name).write_text(whole)
-        self.assertEqual(read_training(str(a)).label, "a")
+        self.assertEqual(read_training(a).label, "a")
         copy = a / "eval" / "mujoco (1).json"
         shutil.copy(a / "eval" / "mujoco.json", copy)
         words = r"mujoco \(1\).json has the results of mujoco, expected in mujoco.json"
@@ -488,22 +490,18 @@ class FairnessTest(Compared):
         self.assertRegex(self.compare("a"), words)
 
     def test_policies_that_play_another_task(self):
-        task = replace(TrainConfig().task, termination=TerminationConfig(episode_seconds=2.5))
-        short = TrainConfig(task=task)
-        self.run_and_results("short", config=short)
+        self.run_and_results("short", config=SHORT)
         self.run_and_results("usual")
         expected = r"not the same task.termination.episode_seconds \(2.5: short; 5: usual\)"
         self.assertRegex(self.compare("short", "usual"), expected)
 
     def test_episodes_of_another_length(self):
         """The length of an evaluation counts, and not that of the training, if the result states it."""
-        task = replace(TrainConfig().task, termination=TerminationConfig(episode_seconds=2.5))
-        short = TrainConfig(task=task)
         self.run_and_results("earlier")  # of a version that did not state the length
         for name, config, seconds, words in (
             ("usual", None, 5.0, ""),
             ("long", None, 12.0, r"episode_seconds \(5: earlier; 12: long\)"),
-            ("short", short, 5.0, ""),
+            ("short", SHORT, 5.0, ""),
         ):
             with self.subTest(name):
                 self.write_run(name, config)
@@ -559,7 +557,7 @@ class WrittenTest(Compared):
 
     def test_curves(self):
         names = self.write_three()
-        runs = read_trainings([str(self.folder / name) for name in names])
+        runs = read_trainings([self.folder / name for name in names])
         self.assertEqual(collect(runs[3:]).curves, "")
         default = collect(runs)
         self.assertEqual(default.x, "minutes")

@@ -120,10 +120,13 @@ class FromABankTest(InOneFolder):
             said, r"picture of the first world: \(480, 640, 3\), mean brightness [1-9]"
         )
 
-    def test_pictures_show_the_world_that_was_asked_for(self):
+    def environment(self, num_envs):
         bank = xreset.read_bank(self.bank)
         objects = [xreset.load_object(name) for name in bank.object_names]
-        with xreset.make_env(xreset.load_robot("openarm"), objects, bank, num_envs=2) as env:
+        return xreset.make_env(xreset.load_robot("openarm"), objects, bank, num_envs=num_envs)
+
+    def test_pictures_show_the_world_that_was_asked_for(self):
+        with self.environment(2) as env:
             first = env.render(0, (64, 48))
             self.assertEqual(first.shape, (48, 64, 3))
             self.assertTrue((first == env.render(0, (64, 48))).all())
@@ -160,9 +163,7 @@ class FromABankTest(InOneFolder):
         self.assertLess(float(distance), 5.0, done.stdout)
 
     def test_a_policy_says_where_it_cannot_play(self):
-        bank = xreset.read_bank(self.bank)
-        objects = [xreset.load_object(name) for name in bank.object_names]
-        with xreset.make_env(xreset.load_robot("openarm"), objects, bank, num_envs=1) as env:
+        with self.environment(1) as env:
             for arguments, message in (
                 (
                     ("soup-can", env, "film.mp4"),

@@ -527,7 +527,5 @@ class ChangingSettings(TestCase):
             np.array([[0.0, 0.5]]),
             0.5,
         ):
-            with (
-                refuses(self, "each share greater than the one before", ValueError, points),
-            ):
+            with refuses(self, "each share greater than the one before", ValueError, points):
                 ScheduleConfig(teacher=points)

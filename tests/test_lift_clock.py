@@ -18,6 +18,11 @@ from xreset.learning.log import TrainingLog
 from xreset.learning.run import training_left
 
 
+def marks(lift):
+    """Shares that were passed, and the iterations in which they were."""
+    return [(p.share, p.iteration) for p in lift.passed]
+
+
 class LiftTest(InFolder):
     def after(self, lift, shares, begin=0):
         for i, share in enumerate(shares, begin + 1):
@@ -37,11 +42,11 @@ class LiftTest(InFolder):
 
     def test_a_resumed_run_forgets_what_came_after_its_checkpoint(self):
         again = self.after(Lift(), [0.0, 0.02, 0.0, 0.3]).up_to(3)
-        self.assertEqual([(p.share, p.iteration) for p in again.passed], [(0.01, 2)])
+        self.assertEqual(marks(again), [(0.01, 2)])
         at_checkpoint = self.after(Lift(), [0.0, 0.02]).up_to(2)
-        self.assertEqual([(p.share, p.iteration) for p in at_checkpoint.passed], [(0.01, 2)])
+        self.assertEqual(marks(at_checkpoint), [(0.01, 2)])
         again = self.after(again, [0.0, 0.4], begin=3)
-        self.assertEqual([(p.share, p.iteration) for p in again.passed], [(0.01, 2), (0.1, 5)])
+        self.assertEqual(marks(again), [(0.01, 2), (0.1, 5)])
 
     def test_what_is_left_counts_iterations_and_minutes_of_the_whole_training(self):
         self.assertEqual(training_left(self.folder, 10), "not begun")
@@ -68,9 +73,7 @@ class LiftTest(InFolder):
             with refuses(self, words, FileFormatError):
                 read_lift(self.folder)
             write_json(self.folder / "run.json", {"lift": changes})
-            with (
-                refuses(self, f"run.json: .*{words}", FileFormatError, words),
-            ):
+            with refuses(self, f"run.json: .*{words}", FileFormatError, words):
                 read_lift(self.folder)
             (self.folder / "run.json").unlink()
         write_json(self.folder / "lift.json", {"schema": "xreset-lift/1", "iteration": 4})

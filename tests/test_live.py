@@ -96,6 +96,11 @@ def refuse(*_):
 
 
 class FaultTest(TestCase):
+    def reason(self, driver, controller=None, limits=None, seconds=30):
+        """Run until the robot stops, which is logged; returns why."""
+        with self.assertLogs("xreset"):
+            return Runner(controller or Steady(), driver, limits or Limits()).run(seconds).reason
+
     def stopped(self, driver, controller=None):
         """Run until the robot stops; returns the sentence. The targets must slow down and come to rest."""
         outcome = Runner(controller or Steady(), driver).run(seconds=30)
@@ -135,10 +140,10 @@ class FaultTest(TestCase):
             with self.subTest(name), self.assertLogs("xreset", "WARNING") as logs:
                 if name == "no pose at all":
                     driver = Scripted(fault)
-                    self.assertRegex(Runner(Steady(), driver).run(30).reason or "", words)
+                    self.assertRegex(Runner(Steady(), driver).run(30).reason, words)
                     self.assertEqual((driver.sent, driver.stops), ([], 1))
                     continue
-                self.assertRegex(self.stopped(Scripted(fault)) or "", words)
+                self.assertRegex(self.stopped(Scripted(fault)), words)
                 self.assertEqual(len(logs.output), 1)
 
     def test_joints_slightly_beyond_their_limits_are_tolerated(self):
@@ -176,16 +181,13 @@ class FaultTest(TestCase):
             driver = Scripted()
             controller.target *= 0
             limits = Limits(workspace=((-1, 0, 0), (limit, 1, 1)))
-            with self.assertLogs("xreset"):
-                outcome = Runner(controller, driver, limits).run(30)
-            self.assertIn(words, outcome.reason)
+            self.assertIn(words, self.reason(driver, controller, limits))
         self.assertLess(driver.sent[-1][0], 0.7)
 
     def test_resting_targets_are_sent_as_long_as_the_robot_holds(self):
         driver = Scripted(after(1, object_time=0.99))
-        with self.assertLogs("xreset"):
-            outcome = Runner(Steady(), driver, Limits(hold=3.0)).run(30)
-        self.assertIn("pose of the object", outcome.reason or "")
+        reason = self.reason(driver, limits=Limits(hold=3.0))
+        self.assertIn("pose of the object", reason)
         moves = np.diff(driver.sent, axis=0)
         assert_array_equal(moves[-150:], 0)
         self.assertGreater(driver.time, 5.2)
@@ -198,11 +200,10 @@ class FaultTest(TestCase):
             driver = Scripted(lambda time, reading, name=name: replace(reading, **{name: -5.0}))
             with self.subTest(name), self.assertLogs("xreset"):
                 outcome = Runner(Steady(), driver).run(30)
-                self.assertIn(words, outcome.reason or "")
+                self.assertIn(words, outcome.reason)
                 self.assertEqual((outcome.steps, driver.sent), (0, []))
         driver = Scripted(refuse)
-        with self.assertLogs("xreset"):
-            self.assertIn("the cable is out", Runner(Steady(), driver).run(30).reason or "")
+        self.assertIn("the cable is out", self.reason(driver))
         self.assertEqual((driver.sent, driver.stops), ([], 1))
 
         def late(time, reading):
@@ -219,8 +220,7 @@ class FaultTest(TestCase):
             with self.assertRaisesRegex(LiveError, f"{name} is {value}, expected 0 or more"):
                 Limits(**{name: value})
         driver = Scripted(after(1, object_time=0.99))
-        with self.assertLogs("xreset"):
-            Runner(Steady(), driver, Limits(slow_down=0.0, hold=0.1)).run(30)
+        self.reason(driver, limits=Limits(slow_down=0.0, hold=0.1))
         self.assertTrue(np.isfinite(driver.sent).all())
         assert_array_equal(np.diff(driver.sent[-4:], axis=0), 0)
 
@@ -240,7 +240,7 @@ class FaultTest(TestCase):
         ):
             calls.clear()
             with self.subTest(words), self.assertLogs("xreset"):
-                self.assertRegex(self.stopped(Scripted(), later(result)) or "", words)
+                self.assertRegex(self.stopped(Scripted(), later(result)), words)
 
     def test_a_slow_step_a_lost_driver_and_ctrl_c(self):
         driver = Scripted()
@@ -251,15 +251,11 @@ class FaultTest(TestCase):
 
         with self.assertLogs("xreset"):
             outcome = Runner(Steady(slow), driver).run(30)
-        self.assertRegex(outcome.reason or "", "A control step took 0.98 s too long")
+        self.assertRegex(outcome.reason, "A control step took 0.98 s too long")
         self.assertGreater(outcome.missed, 20)
         driver = Scripted()
-        driver.send = refuse  # type: ignore[method-assign]
-        with self.assertLogs("xreset"):
-            self.assertRegex(
-                Runner(Steady(), driver).run(30).reason or "",
-                "could not send targets: the cable is out",
-            )
+        driver.send = refuse
+        self.assertRegex(self.reason(driver), "could not send targets: the cable is out")
         self.assertEqual(driver.stops, 1)
 
         def interrupted(target):
@@ -285,23 +281,18 @@ class FaultTest(TestCase):
         driver.fault = moved
         self.assertIsNone(Runner(Steady(), driver).run(3).reason)
         self.assertEqual(len(driver.sent), 150)
-        driver.wait_until = lambda moment: None  # type: ignore[method-assign]
-        with self.assertLogs("xreset"):
-            outcome = Runner(Steady(), driver).run(3)
-        self.assertRegex(
-            outcome.reason or "", "waits 0.1. s too little, so the policy runs too fast"
-        )
+        driver.wait_until = lambda moment: None
+        words = "waits 0.1. s too little, so the policy runs too fast"
+        self.assertRegex(self.reason(driver, seconds=3), words)
 
     def test_a_clock_that_nobody_moves(self):
         driver = Scripted()
-        driver.wait_until = lambda moment: None  # type: ignore[method-assign]
-        with self.assertLogs("xreset"):
-            outcome = Runner(Steady(), driver).run(30)
-        self.assertRegex(outcome.reason or "", "too fast. Override now.. and wait_until")
+        driver.wait_until = lambda moment: None
+        self.assertRegex(self.reason(driver), "too fast. Override now.. and wait_until")
         self.assertEqual(driver.stops, 1)
         self.assertLess(len(driver.sent), 10)
 
-        driver.wait_until = lambda moment: setattr(driver, "time", moment // 0.05 * 0.05)  # type: ignore[method-assign]
+        driver.wait_until = lambda moment: setattr(driver, "time", moment // 0.05 * 0.05)
         self.assertIsNone(Runner(Steady(), driver).run(3).reason, "a coarse clock is no fault")
 
     def test_late_data_are_used_and_single_faults_are_ignored(self):
@@ -384,7 +375,7 @@ class SafetyTest(TestCase):
         with self.assertLogs("xreset"):
             outcome, rows = self.lift(Limits(joint_speed=0.3, hold=1.0))
         self.assertRegex(
-            outcome.reason or "", r"Joint lift moves at 0\.\d\d, faster than its limit 0\.60"
+            outcome.reason, r"Joint lift moves at 0\.\d\d, faster than its limit 0\.60"
         )
         self.assertLess(abs(rows[-1, 1]), 0.01)
         self.assertLess(rows[-1, 0], 0.25)
@@ -393,7 +384,7 @@ class SafetyTest(TestCase):
         with self.assertLogs("xreset"):
             limits = Limits(target_speed=0.1, pose_age=0.2, hold=2.0)
             outcome, rows = self.lift(limits, after(0.5, object_time=np.array([0.5])))
-        self.assertIn("pose of the object is", outcome.reason or "")
+        self.assertIn("pose of the object is", outcome.reason)
         held = rows[-90:]
         assert_allclose(held[:, 0], held[0, 0], atol=1e-3)
         assert_allclose(held[:, 2], held[0, 2], atol=2e-3)

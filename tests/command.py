@@ -5,6 +5,7 @@ import functools
 import inspect
 import io
 import os
+import shlex
 import signal
 import subprocess
 import threading
@@ -17,13 +18,17 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def xreset(*arguments):
-    """Run ``xreset ARGUMENTS``: its exit code, and what it prints as output and as errors."""
+    """Run ``xreset ARGUMENTS``, in which a text may hold several words, quoted as in a shell: its exit code, and what it
+    prints as output and as errors."""
+    words = []
+    for argument in arguments:
+        words += shlex.split(argument) if isinstance(argument, str) else [str(argument)]
     code = 0
     out = io.StringIO()
     err = io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         try:
-            main([str(argument) for argument in arguments])
+            main(words)
         except SystemExit as end:
             code = int(end.code or 0)
     return code, out.getvalue(), err.getvalue()

@@ -114,7 +114,7 @@ class PlaceTest(InFolder):
         write_demos(file, demos)
         self.enterContext(patch("xreset.retarget.pipeline.wrist_paths", return_value=[]))
         with patch.object(placing, "place", side_effect=RobotError("found")) as place:
-            xreset("robots", "place", "openarm", "--demos", file)
+            xreset("robots place openarm --demos", file)
         frames = demos.hand_valid.sum() + len(demos.object_pos)
         self.assertEqual(place.call_args.args[2].shape, (frames, 3))
 
@@ -285,8 +285,8 @@ class WritePlacementTest(InFolder):
             patch("xreset.retarget.pipeline.wrist_paths", return_value=[]),
             patch.object(placing, "place", return_value=found) as place,
         ):
-            command = ("robots", "place", self.folder, "--demos", f"{self.folder}/demos.npz")
-            said = succeeds(*command, "--write", "--search.rounds", "1")
+            command = ("robots place", self.folder, "--demos", f"{self.folder}/demos.npz")
+            said = succeeds(*command, "--write --search.rounds 1")
         self.assertEqual(place.call_args.args[3], PlaceConfig(rounds=1))
         rows = r"87\.6%\W+91\.2%\W+0\.500\W+0\.1000, 0\.2000, 0\.3000[\s\S]*75\.0%"
         self.assertRegex(said, rows)

@@ -271,7 +271,7 @@ class TargetsTest(TestCase):
         assert_close(chosen.joint_target, chosen.joint_pos + 0.25)
 
 
-PLAIN = ("--closing.spacing", "None", "--squeeze.force", "0", "--transfer.per-pose", "0")
+PLAIN = "--closing.spacing None --squeeze.force 0 --transfer.per-pose 0"
 """Options for a bank of frames that do not press."""
 
 
@@ -288,10 +288,10 @@ class CommandTest(InFolder):
 
     def test_everything_at_once(self):
         """Jaws close by 30 mm (33 mm on one side): five states between; held by 2.5 N a side, and not without."""
-        plain, _ = self.resets(*PLAIN)
+        plain, _ = self.resets(PLAIN)
         self.assertEqual((plain.num_states, plain.num_pressing), (3, 0))
         self.assertEqual((plain.joint_target, plain.frame_part), (None, None))
-        bank, out = self.resets(*PLAIN, "--closing.spacing", "0.0056", "--squeeze.force", "2.5")
+        bank, out = self.resets(PLAIN, "--closing.spacing 0.0056 --squeeze.force 2.5")
         assert bank.frame_part is not None
         assert_allclose(bank.frame_part * 6, [0, 1, 2, 3, 4, 5, 0, 0], atol=1e-5)
         self.assertEqual(bank.frame_index.tolist(), [0] * 6 + [1, 2])

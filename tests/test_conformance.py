@@ -646,7 +646,7 @@ class Harness(InFolder):
     def test_command(self):
         file = self.folder / "c.json"
         words = "engines check --engine mujoco --check free_fall"
-        command = (*words.split(), "--json", file)
+        command = (words, "--json", file)
         said = succeeds(*command)
         self.assertIn("no check failed", said)
         data = json.loads(file.read_text())
@@ -666,8 +666,3 @@ class Harness(InFolder):
         self.assertEqual(
             json.loads(file.read_text())["runs"][0]["checks"][0]["measures"][0]["measured"], "nan"
         )
-
-
-if __name__ == "__main__":
-    torch.set_num_threads(1)
-    unittest.main()

@@ -503,7 +503,7 @@ class Commands(InFolder):
         file = self.folder / "right.npz"
         rest = self.folder / "rest.npz"
         write_demos(file, synthesize(["soup"], 2, fps=10))
-        said = refused("demos", "select", file, "--per-object", 1, "--mirror", "--rest", rest)
+        said = refused("demos select", file, "--per-object 1 --mirror --rest", rest)
         self.assertIn("no hand side left", said)
         self.assertFalse(rest.exists())
 
@@ -511,26 +511,25 @@ class Commands(InFolder):
         file = self.folder / "one.npz"
         out = self.folder / "out.npz"
         write_demos(file, synthesize(["soup"], 1, fps=10))
-        said = refused("demos", "select", file, self.folder / "." / "one.npz", "--out", out)
+        said = refused("demos select", file, self.folder / "." / "one.npz", "--out", out)
         self.assertIn("one.npz is given twice. Give each archive once.", said)
-        said = refused("demos", "synth", "--objects", "soup", "005_tomato_soup_can", "--out", out)
+        said = refused("demos synth --objects soup 005_tomato_soup_can --out", out)
         self.assertIn("The object 005_tomato_soup_can is given twice. Name each object once.", said)
         self.assertFalse(out.exists())
 
     def test_one_sequence_is_not_called_sequences(self):
         file = self.folder / "one.npz"
-        said = succeeds("demos", "synth", "--objects", "soup", "--per-object", 1, "--out", file)
+        said = succeeds("demos synth --objects soup --per-object 1 --out", file)
         self.assertRegex(said, r"one\.npz: 1 sequence, \d+ frames at")
         self.assertEqual(quantity(0, "error"), "0 errors")
 
     def test_synth_then_info(self):
         file = self.folder / "demos.npz"
-        options = "--objects soup --per-object 1 --side both --fps 10"
-        synth = ("demos", "synth", "--out", file, *options.split())
+        synth = ("demos synth --objects soup --per-object 1 --side both --fps 10 --out", file)
         out = succeeds(*synth)
         first = file.read_bytes()
         self.assertEqual(read_demos(file).hand_side.tolist(), ["right", "left"])
-        info = succeeds("demos", "select", file)
+        info = succeeds("demos select", file)
         self.assertIn(info, out)
         self.assertRegex(info, r"005_tomato_soup_can\W+1\W+1\W+\d+\W+100%")
         succeeds(*synth)
@@ -541,35 +540,35 @@ class Commands(InFolder):
             f"{self.folder}/{name}.npz" for name in ("demos", "a", "b", "both")
         )
         write_demos(file, synthesize(["soup"], 2, fps=10))
-        for command in (
-            ("select", file, "--out", left, "--rest", rest, "--share", 0.5),
-            ("select", left, rest, "--out", both),
-            ("select", both, "--out", left, "--per-object", "1", "--pick", "spread"),
+        for words in (
+            f"{file} --out {left} --rest {rest} --share 0.5",
+            f"{left} {rest} --out {both}",
+            f"{both} --out {left} --per-object 1 --pick spread",
         ):
-            succeeds("demos", *command)
+            succeeds("demos select", words)
         names = read_demos(both).sequence_name.tolist()
         self.assertEqual(names, read_demos(file).sequence_name.tolist())
         self.assertEqual(read_demos(left).sequence_name.tolist(), names[1:])
         self.assertIn(
             "Nothing was overwritten",
-            refused("demos", "select", file, "--out", left, "--rest", left, "--share", 0.5),
+            refused("demos select", file, "--out", left, "--rest", left, "--share 0.5"),
         )
         one = f"{self.folder}/one.npz"
         write_demos(one, synthesize(["banana"], 1, fps=10))
-        said = succeeds("demos", "select", file, one, "--per-object", "1", "--rest", rest)
+        said = succeeds("demos select", file, one, "--per-object 1 --rest", rest)
         self.assertIn("011_banana: no sequence is left", said)
 
     def test_select_by_person(self):
         file, known, new = (f"{self.folder}/{name}.npz" for name in ("demos", "known", "new"))
         demos = synthesize(["soup"], 2, fps=10)
         write_demos(file, replace(demos, subject=np.array(["ann", "bob"])))
-        succeeds("demos", "select", file, "--subjects", "ann", "--out", known, "--rest", new)
+        succeeds("demos select", file, "--subjects ann --out", known, "--rest", new)
         self.assertEqual(read_demos(known).subject.tolist(), ["ann"])
         self.assertEqual(read_demos(new).subject.tolist(), ["bob"])
 
     def test_import(self):
         file = self.folder / "demos.npz"
         self.assertIn(
-            "no DexYCB sequence", refused("demos", "import", "dexycb", self.folder, "--out", file)
+            "no DexYCB sequence", refused("demos import dexycb", self.folder, "--out", file)
         )
         self.assertFalse(file.exists())

@@ -62,7 +62,7 @@ def help_of(words):
     """Return the help text of a command."""
     out = succeeds(*words, "--help")
     if tuple(words) == ("train",):
-        out += succeeds("train", "--help-config", "all")
+        out += succeeds("train --help-config all")
     assert not re.search(r":[a-z]+:`", out), f"a reference that only the site shows: {out}"
     return out
 

@@ -210,15 +210,15 @@ class Wrong(InFolder):
         text = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(file_type="obj")
         (meshes / "005_tomato_soup_can.obj").write_text(text)
         words = "The object starts 60 mm inside the table. The poses may be"
-        take = ["--order", "mediapipe", "--units", "m", "--coordinates", "table", "--fps", "10"]
-        take = ("demos", "import", "keypoints", self.folder / "a.npz", "--out", out, *take)
+        what = "--order mediapipe --units m --coordinates table --fps 10"
+        take = ("demos import keypoints", self.folder / "a.npz", "--out", out, what)
         given = ("--meshes", meshes)
         self.assertIn(words, refused(*take, *given))
         self.assertFalse(out.exists())
         for said in (
             succeeds(*take, *given, "--trust-recordings"),
-            succeeds("demos", "select", out, *given),
+            succeeds("demos select", out, *given),
             succeeds("view", out, "--png", self.folder / "a.png"),
-            refused("retarget", out, "--robot", "ur7e-sharpa", "--out", self.folder / "r.npz"),
+            refused("retarget", out, "--robot ur7e-sharpa --out", self.folder / "r.npz"),
         ):
             self.assertEqual(said.count(words), 1, said)

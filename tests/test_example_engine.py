@@ -1,8 +1,6 @@
 """Engine plugins: how they are found and what goes wrong; and the examples, where their engines are installed."""
 
-import contextlib
 import importlib
-import io
 import re
 import sys
 import tomllib
@@ -15,11 +13,11 @@ from unittest.mock import patch
 import torch
 from torch.testing import assert_close
 
+from tests.command import succeeds
 from tests.data import InFolder
 from tests.engine_checks import with_drive
 from xreset.backends.conformance import CHECKS, run
 from xreset.backends.conformance.scene import scene
-from xreset.cli import main
 from xreset.errors import BackendUnavailableError, CapabilityError
 from xreset.physics import plugins
 from xreset.physics.plugins import backend_status, make_backend
@@ -68,10 +66,9 @@ class PluginTest(InFolder, Unavailable):
         self.assertEqual(backend_status("someones").version, "7.1")
         with make_backend("someones", scene(), 1) as backend:
             self.assertEqual(backend.name, "someones")
-        with contextlib.redirect_stdout(io.StringIO()) as out:
-            main(["engines", "check", "--engine", "someones", "--check", "state_round_trip"])
-        self.assertIn("someones 7.1", out.getvalue())
-        self.assertIn("no check failed", out.getvalue())
+        said = succeeds("engines check --engine someones --check state_round_trip")
+        self.assertIn("someones 7.1", said)
+        self.assertIn("no check failed", said)
 
     def test_a_plugin_that_cannot_be_used_says_why(self):
         backend = "SomeonesBackend"
@@ -109,9 +106,7 @@ class PluginTest(InFolder, Unavailable):
             "    def engine_version(cls): raise KeyError('version')\n"
         )
         self.assertIn("engine_version() fails: KeyError", backend_status("someones").reason or "")
-        with contextlib.redirect_stdout(io.StringIO()) as out:
-            main(["engines", "list"])
-        self.assertIn("someones", out.getvalue())
+        self.assertIn("someones", succeeds("engines list"))
 
 
 class ExampleTest(Unavailable):

@@ -168,9 +168,9 @@ class Arrays(Case):
 
     def test_the_command_takes_engines_and_words(self):
         out = self.folder / "out.npz"
-        options = ("--engine", "sapien", "--task", "Lift the {object}.", "--out", out)
+        options = ("--engine sapien --task 'Lift the {object}.' --out", out)
         self.assertIn(
-            "2 episodes of ur7e-sharpa", succeeds("export", "episodes", self.evaluate(), *options)
+            "2 episodes of ur7e-sharpa", succeeds("export episodes", self.evaluate(), *options)
         )
         with np.load(out) as file:
             self.assertEqual(file["engine"].tolist(), ["sapien", "sapien"])

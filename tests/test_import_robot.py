@@ -112,7 +112,7 @@ class Toy(Robots):
         cls.hand.write_text(HAND)
         out = cls.sources / "mine"
         parts = ("--arm", cls.arm, "--hand", cls.hand)
-        cls.said = succeeds("robots", "import", *parts, "--out", out)
+        cls.said = succeeds("robots import", *parts, "--out", out)
         cls.spec = load_robot(cls.sources / "mine")
 
     def imported(self, hand, arm=None, **options):
@@ -655,7 +655,7 @@ class Toy(Robots):
         )
         self.assertEqual(mount.parent, "l5")
         whole = self.file("whole.urdf", WHOLE)
-        said = succeeds("robots", "import", "--hand", whole, "--out", self.folder / "mine")
+        said = succeeds("robots import --hand", whole, "--out", self.folder / "mine")
         spec = load_robot(self.folder / "mine")
         for field in ("joint_names", "mimics", "fingertips", "keypoints"):
             self.assertEqual(getattr(spec, field), getattr(self.spec, field), field)

@@ -1,7 +1,5 @@
 """The judge of a robot: which accepted states hold, lift and turn their object."""
 
-import io
-from contextlib import redirect_stdout
 from dataclasses import replace
 
 import numpy as np
@@ -9,10 +7,10 @@ import torch
 from PIL import Image
 
 from tests import toy_grasp
+from tests.command import succeeds
 from tests.data import InFolder
 from tests.toy_grasp import OPEN, brick, robot
 from xreset import SqueezeConfig, load_robot, write_bank
-from xreset.cli import main
 from xreset.errors import DemoError, RobotError
 from xreset.geometry.kinematics import Kinematics
 from xreset.robot_tools import judge as judging
@@ -92,13 +90,11 @@ class Judge(InFolder):
     def test_a_weak_grip_drops_in_the_command(self):
         self.enterContext(toy_grasp.found())
         write_bank(f"{self.folder}/bank.npz", bank())
-        words = (
-            f"--robot gripper --engine mujoco --squeeze.force 0.2 --picture {self.folder}/judge.png"
-        )
-        with redirect_stdout(io.StringIO()) as output:
-            main(["robots", "judge", f"{self.folder}/bank.npz", *words.split()])
-        self.assertRegex(output.getvalue(), r"brick +│ +3 +│ 0, 0, 0")
-        self.assertIn("in 3 of 3 states", output.getvalue())
-        self.assertIn("place counts frames in which the arm follows the human", output.getvalue())
-        self.assertIn("demonstrations in reach): brick 0%", output.getvalue())
-        self.assertEqual(Image.open(self.folder / "judge.png").size[0], 4 * judging._TILE[0])
+        words = "--robot gripper --engine mujoco --squeeze.force 0.2 --picture"
+        picture = self.folder / "judge.png"
+        said = succeeds("robots judge", self.folder / "bank.npz", words, picture)
+        self.assertRegex(said, r"brick +│ +3 +│ 0, 0, 0")
+        self.assertIn("in 3 of 3 states", said)
+        self.assertIn("place counts frames in which the arm follows the human", said)
+        self.assertIn("demonstrations in reach): brick 0%", said)
+        self.assertEqual(Image.open(picture).size[0], 4 * judging._TILE[0])

@@ -257,7 +257,7 @@ class Synthetic(InFolder):
             )
         np.savetxt(self.folder / "T.txt", np.eye(4))
         out = self.folder / "out.npz"
-        command = ["demos", "import", "keypoints", source, "--out", out]
+        command = ("demos import keypoints", source, "--out", out)
         code, _, said = xreset(*command)
         self.assertNotEqual(code, 0)
         for option in ("--order", "--units", "--coordinates"):
@@ -266,7 +266,7 @@ class Synthetic(InFolder):
         words = "--order mediapipe --units mm --coordinates camera --fps 10 --side right --object 005_tomato_soup_can"
         self.assertIn(
             "2 sequences",
-            succeeds(*command, *words.split(), "--table-from-camera", f"{self.folder}/T.txt"),
+            succeeds(*command, words, "--table-from-camera", f"{self.folder}/T.txt"),
         )
         self.assertEqual(read_demos(out).sequence_name.tolist(), ["one", "two"])
 

@@ -68,7 +68,7 @@ class MirrorTest(InOneFolder):
     def test_the_command_mirrors_the_left_hands_of_an_archive(self):
         files = [self.folder / name for name in ("demos.npz", "mirrored.npz")]
         write_demos(files[0], merge_demos([self.demos, synthesize(["soup"], 1, 0)]))
-        said = succeeds("demos", "select", files[0], "--mirror", "--out", files[1])
+        said = succeeds("demos select", files[0], "--mirror --out", files[1])
         self.assertRegex(said, r"mustard_bottle: \d\.\d mm from its reflection, mirrored")
         found = read_demos(files[1])
         self.assertEqual(found.object_name.tolist(), ["006_mustard_bottle"])

@@ -353,8 +353,8 @@ class Comparing(InFolder):
             with mock.patch(
                 "xreset.eval.engines.agreement.compare", lambda *_, result=result, **__: result
             ):
-                options = ("--engine", "mujoco", "--json", self.folder / "parity.json")
-                found, text, _ = xreset("engines", "compare", path, *options)
+                options = ("--engine mujoco --json", self.folder / "parity.json")
+                found, text, _ = xreset("engines compare", path, *options)
             self.assertEqual(found, code)
             self.assertIn("press, fingertip", text)
             self.assertIn("missed: heavy: hold, outcome" if code else "all targets met", text)
@@ -362,7 +362,7 @@ class Comparing(InFolder):
             self.assertEqual((data["schema"], data["ok"]), ("xreset-measured/1", not code))
         self.assertEqual(len(data["grasps"]["hold"]), len(data["reference"]["carried"]["hold 0.5"]))
         self.assertIn(
-            "for the robot 'ur7e-sharpa'", refused("engines", "compare", path, "--robot", "openarm")
+            "for the robot 'ur7e-sharpa'", refused("engines compare", path, "--robot openarm")
         )
 
 

@@ -393,9 +393,7 @@ class PipelineTest(InOneFolder):
         write_demos(f"{self.folder}/left.npz", left)
         out = self.folder / "left-robot.npz"
         words = "As a left hand its fingers bend"
-        said = refused(
-            "retarget", f"{self.folder}/left.npz", "--out", out, "--robot", "ur7e-sharpa"
-        )
+        said = refused("retarget", f"{self.folder}/left.npz", "--out", out, "--robot ur7e-sharpa")
         self.assertIn(words, said)
         said = self.commanded("left", "ur7e-sharpa", "--trust-recordings")
         self.assertIn(words, said)

@@ -155,11 +155,11 @@ class VerdictTest(TestCase):
 class CommandTest(InFolder):
     def test_a_verdict_from_the_command_line(self):
         demos = self.folder / "demos.npz"
-        succeeds("demos", "synth", "--objects", SOUP, "--per-object", 1, "--out", demos)
+        succeeds("demos synth --objects", SOUP, "--per-object 1 --out", demos)
         policy = shipped()["soup-can"]
-        options = ("--demos", demos, "--engine", "mujoco", "--episodes", 1, "--out", self.folder)
-        faults = ("--property", "published-faults=0.5", "--property", "lost-frames=1.2")
-        out = succeeds("stress", policy, *options, *faults)
+        options = ("--demos", demos, "--engine mujoco --episodes 1 --out", self.folder)
+        faults = "--property published-faults=0.5 --property lost-frames=1.2"
+        out = succeeds("stress", policy, *options, faults)
         self.assertIn("No verdict: not every fault that decides was tried.", out)
         (found,) = read_evaluation(self.folder)
         names = found.changed["property"].tolist()
@@ -172,7 +172,7 @@ class CommandTest(InFolder):
             stress("soup-can", demos, properties="pose-delay=1", out=self.folder)
         after = (self.folder / "mujoco.json").read_bytes()
         self.assertEqual(after, before, "results of a whole sweep stay")
-        earlier = xreset("rehearse", policy, *options, "--fault", "pose-delay=200")
+        earlier = xreset("rehearse", policy, *options, "--fault pose-delay=200")
         self.assertEqual(earlier[0], 1)
         for words in (
             "rehearse is now stress --faults",

@@ -184,7 +184,7 @@ class Registry(Copied):
             self.assertEqual(robot_names(), ["broken", "openarm"])
             self.assertEqual(load("openarm").name, "openarm")
             self.assertRaisesRegex(RobotError, "'broken'.*xreset_no_such_package", load, "broken")
-            output = succeeds("robots", "list")
+            output = succeeds("robots list")
         self.assertRegex(output, r"broken[\s\S]*openarm")
 
     def refused(self, *parts):
@@ -329,6 +329,6 @@ class Registry(Copied):
         )
 
     def test_command_fails_on_errors_only(self):
-        succeeds("robots", "check", self.folder)
+        succeeds("robots check", self.folder)
         self.edit("robot.toml", {'palm = "palm"': 'palm = "plam"'})
-        self.assertIn("'plam'", refused("robots", "check", self.folder))
+        self.assertIn("'plam'", refused("robots check", self.folder))

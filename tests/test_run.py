@@ -57,14 +57,13 @@ class Run(InFolder, TestCase):
         out = self.folder / "out"
         write_demos(demos, synthesize(["soup"], 1, fps=5))
         for wrong in ("--robot nobody", "--recipe nothing", "--minutes 0", "--engine none"):
-            words = f"--robot openarm {wrong}".split()
             with patch.object(command, "perform") as performed:
-                refused("run", demos, *words, "--out", out)
+                refused("run", demos, "--robot openarm", wrong, "--out", out)
             self.assertFalse(performed.called or out.exists(), wrong)
         write_demos(demos, synthesize(["soup", "spam"], 1, fps=5))
         with patch.object(command, "quick_engines") as loaded:
-            said = refused("run", demos, "--robot", "openarm", "--num-envs", 1, "--out", out)
+            said = refused("run", demos, "--robot openarm --num-envs 1 --out", out)
         self.assertIn("1 world cannot hold 2 objects", said)
         self.assertFalse(loaded.called or out.exists(), "engines take seconds to load")
-        said = refused("run", demos, "--robot", "openarm", "--out", demos / "run")
+        said = refused("run", demos, "--robot openarm --out", demos / "run")
         self.assertIn("cannot make the folder", said)

@@ -21,6 +21,11 @@ from xreset.runtime import Controller
 from xreset.task.config import TerminationConfig, evaluation_task
 
 
+def rest(env):
+    """Take a step in which no joint moves."""
+    return env.step(np.zeros((N, env.env.num_actions), np.float32))
+
+
 class StableBaselinesTest(WithEnv):
     def wrapped(self, seconds, **options):
         task = replace(TASK, termination=TerminationConfig(episode_seconds=seconds))
@@ -30,11 +35,10 @@ class StableBaselinesTest(WithEnv):
 
     def test_the_last_observation_of_a_truncated_episode_is_given(self):
         env = self.wrapped(0.1)
-        still = np.zeros((N, env.env.num_actions), np.float32)
         env.seed(3)
         first = env.reset()["policy"]
         for step in range(1, 2 * env.env.max_episode_length + 1):
-            observations, _, done, infos = env.step(still)
+            observations, _, done, infos = rest(env)
             ends = step % env.env.max_episode_length == 0
             self.assertEqual(done.tolist(), [ends] * N)
             for world, info in enumerate(infos):
@@ -53,11 +57,10 @@ class StableBaselinesTest(WithEnv):
 
     def test_a_world_that_fails_is_terminated_and_the_others_go_on(self):
         env = self.wrapped(1.0, kind=BreakableBackend)
-        still = np.zeros((N, env.env.num_actions), np.float32)
         env.reset()
-        before, *_ = env.step(still)
+        before, *_ = rest(env)
         env.env.backend.broken[0] = True
-        observations, reward, done, infos = env.step(still)
+        observations, reward, done, infos = rest(env)
         self.assertEqual(done.tolist(), [True] + [False] * (N - 1))
         self.assertEqual((infos[0]["TimeLimit.truncated"], infos[0]["faulty"]), (False, True))
         self.assertEqual(reward[0], 0.0)
@@ -79,13 +82,12 @@ class StableBaselinesTest(WithEnv):
 
     def test_no_network_gets_what_is_for_critics(self):
         env = self.wrapped(0.1)
-        still = np.zeros((N, env.env.num_actions), np.float32)
         groups = {"policy", "proprio", "perception"}
         self.assertLessEqual(groups, set(env.observation_space))
         self.assertIn("privileged", env.env.get_observations().keys())
         seen = [env.reset()]
         while len(seen) < 3:
-            observations, _, done, infos = env.step(still)
+            observations, _, done, infos = rest(env)
             if done.any():
                 seen += [observations, infos[0]["terminal_observation"]]
         for each in seen:
@@ -135,12 +137,12 @@ class PlayedTest(InOneFolder):
         file = self.folder / "mine.onnx"
         file.write_bytes(self.graph)
         demos = self.folder / "demos.npz"
-        succeeds("demos", "synth", "--objects", SOUP, "--per-object", 1, "--out", demos)
-        options = ("--demos", demos, "--engine", "mujoco", "--episodes", 1)
+        succeeds("demos synth --objects", SOUP, "--per-object 1 --out", demos)
+        options = ("--demos", demos, "--engine mujoco --episodes 1")
         succeeds("eval", file, *options, "--out", self.folder / "eval")
         (found,) = read_evaluation(self.folder / "eval")
         self.assertEqual((found.policy, found.robot, len(found.episodes)), ("mine", "openarm", 1))
-        options += ("--property", "pose-delay=0.2")
+        options += ("--property pose-delay=0.2",)
         succeeds("stress", file, *options, "--out", self.folder / "stress")
         (found,) = read_evaluation(self.folder / "stress")
         self.assertEqual(found.changed["property"].tolist(), ["pose-delay"])

@@ -125,12 +125,12 @@ class CommandTest(InFolder):
         from xreset.backends.mujoco import MujocoBackend
 
         demos = self.folder / "demos.npz"
-        succeeds("demos", "synth", "--objects", SOUP, "--per-object", 1, "--out", demos)
-        options = ("--robot", "openarm", "--demos", demos, "--episodes", 1)
-        sweeps = ("--property", "arm-stiffness=0.5", "--property", "action-latency=0.02")
-        sweeps += ("--property", "camera-latency=0.03")  # of cameras, which the policy lacks
+        succeeds("demos synth --objects", SOUP, "--per-object 1 --out", demos)
+        options = ("--robot openarm --demos", demos, "--episodes 1")
+        sweeps = "--property arm-stiffness=0.5 --property action-latency=0.02"
+        sweeps += " --property camera-latency=0.03"  # of cameras, which the policy lacks
         with patch.object(MujocoBackend, "capabilities", MujocoBackend.capabilities - {"drives"}):
-            out = succeeds("stress", "zero", *options, "--out", self.folder, *sweeps)
+            out = succeeds("stress zero", *options, "--out", self.folder, sweeps)
         (found,) = read_evaluation(self.folder)
         self.assertEqual((found.policy, len(found.nominal)), ("zero", 1))
         self.assertEqual(list(found.left_out), ["arm-stiffness"])
@@ -143,9 +143,9 @@ class CommandTest(InFolder):
         text = (self.folder / "report" / "index.html").read_text()
         self.assertIn("What it tolerates", text)
         before = (self.folder / "mujoco.json").read_bytes()
-        options += ("--out", self.folder, *sweeps)
+        options += ("--out", self.folder, sweeps)
         with claim(self.folder):
-            self.assertIn("another command is writing", refused("stress", "zero", *options))
+            self.assertIn("another command is writing", refused("stress zero", *options))
         with patch("xreset.eval.experiment.roll_out", side_effect=KeyboardInterrupt):
-            self.assertEqual(xreset("stress", "zero", *options)[0], 130)
+            self.assertEqual(xreset("stress zero", *options)[0], 130)
         self.assertEqual((self.folder / "mujoco.json").read_bytes(), before, "complete results")

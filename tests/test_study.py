@@ -1,10 +1,8 @@
 """Studies: the file, the plan, running its steps, and the tables; and one whole study of seconds."""
 
-import io
 import json
 import re
 import subprocess
-from contextlib import redirect_stdout
 from dataclasses import asdict, replace
 from pathlib import Path
 from unittest import TestCase
@@ -186,20 +184,24 @@ class PlanTest(Studied):
         self.assertFalse(self.out.exists())
         self.assertEqual(len(self.plan(BASE + runs, only=("ik",)).runs), 1)
 
+    def given_to_train(self, plan):
+        """What the command of the plan's one training passes on."""
+        (train,) = (s for s in plan.steps.values() if s.kind == "train")
+        (command,) = train.todo()[1]
+        with calls_of(verbs, "train") as calls:
+            main(command[len(XRESET) :])
+        return calls[0]
+
     def test_changes_of_the_recipe_are_flags(self):
         changes = "task.reset = { random_gravity = false, demo_probability = 0.25, object_share = { 010_potted_meat_can = 3.0 } }\nmodel.pointnet = [8, 6]\ntask.action.hand_zero = 'middle'\n"
         plan = self.plan(f"{BASE}[runs.a]\nsteps = 1e6\nnum_envs = 64\n[runs.a.config]\n{changes}")
-        (train,) = (s for s in plan.steps.values() if s.kind == "train")
         (planned,) = plan.runs
         reset = TrainConfig().task.reset
         self.assertEqual(planned.config.iterations, 977)
         shares = {"010_potted_meat_can": 3.0}
         changed = replace(reset, random_gravity=False, demo_probability=0.25, object_share=shares)
         self.assertEqual(planned.config.task.reset, changed)
-        (command,) = train.todo()[1]
-        with calls_of(verbs, "train") as calls:
-            main(command[len(XRESET) :])
-        (given,) = calls
+        given = self.given_to_train(plan)
         self.assertEqual(replace(given["config"], iterations=given["iterations"]), planned.config)
         self.assertEqual(list(flags({"config": {"a": {"b_c": True}}})), ["--config.a.b-c"])
 
@@ -216,11 +218,7 @@ class PlanTest(Studied):
             policy.object_rotation = { function = "object_quat", noise = 0.02 }
         """
         plan = self.plan(f"{BASE}[runs.a]\nsteps = 1e6\nnum_envs = 64\n{changes}")
-        (train,) = (s for s in plan.steps.values() if s.kind == "train")
-        (command,) = train.todo()[1]
-        with calls_of(verbs, "train") as calls:
-            main(command[len(XRESET) :])
-        task = calls[0]["config"].task
+        task = self.given_to_train(plan)["config"].task
         (planned,) = plan.runs
         self.assertEqual(
             (task.reward.terms["reach"]["width"], "wide" in task.reward.terms), (0.3, True)
@@ -445,9 +443,8 @@ class WholeTest(InOneFolder):
         cls.out = cls.folder / "out"
         # another interpreter for each command takes longer than most commands; LaunchTest starts some
         here = patch("xreset.eval.study.launch._run", lambda command: main(command[len(XRESET) :]))
-        with here, redirect_stdout(io.StringIO()) as said:
-            main(["study", "seconds", "--out", str(cls.out)])
-        cls.said = said.getvalue()
+        with here:
+            cls.said = succeeds("study seconds --out", cls.out)
         cls.text = study_path("seconds").read_text()
 
     def plan(self, *changes):
@@ -473,7 +470,7 @@ class WholeTest(InOneFolder):
 
     def test_what_is_done_is_not_done_again(self):
         before = {f: f.stat().st_mtime_ns for f in self.out.glob("*-seed0/**/*") if f.is_file()}
-        said = succeeds("study", "seconds", "--out", self.out)
+        said = succeeds("study seconds --out", self.out)
         self.assertNotIn("+ xreset", said)
         self.assertEqual({f: f.stat().st_mtime_ns for f in before}, before)
         self.assertEqual({s.name for s in self.plan().steps.values() if s.left()}, set())
@@ -529,7 +526,7 @@ class WholeTest(InOneFolder):
         self.assertEqual(plan.steps["train x-reset-seed0"].left(), "")
 
     def test_a_dry_run_prints_the_plan(self):
-        said = succeeds("study", "seconds", "--out", f"{self.folder}/none", "--dry-run")
+        said = succeeds("study seconds --out", f"{self.folder}/none", "--dry-run")
         self.assertRegex(
             said,
             r"(?s)train x-reset-seed0: not begun \(after data .*\n    xreset train --out .*/none/x-reset-seed0 --iterations 2",

@@ -23,7 +23,7 @@ from numpy.testing import assert_array_equal
 from onnx import numpy_helper
 from torch.testing import assert_close
 
-from tests.command import calls_of, started
+from tests.command import calls_of, refused, started, succeeds
 from tests.data import refuses
 from tests.toy_bank import SOUP, SPAM, toy_bank
 from tests.toy_goals import toy_goals
@@ -280,10 +280,7 @@ class TrainingTest(WithBank):
         out = self.folder / "job-again"
 
         def again(**changes):
-            options = OPTIONS | {"bank": self.bank, "config": ONE} | changes
-            with quickly() as said:
-                train(out=out, **options)
-            return said.getvalue()
+            return self.resume(out, **OPTIONS | {"bank": self.bank, "config": ONE} | changes)
 
         again()
         first = latest_checkpoint(out).read_bytes()
@@ -422,20 +419,21 @@ class TrainingTest(WithBank):
         self.assertEqual(progress, sorted(progress))
 
     def test_a_configuration_starts_from_a_recipe_or_from_another_run(self):
-        def parsed(*arguments):
+        new = "train --robot openarm --resets bank.npz --out run"
+
+        def parsed(arguments=""):
             with calls_of(verbs, "train") as calls:
-                new = "train --robot openarm --resets bank.npz --out run"
-                main([*new.split(), *arguments])
+                succeeds(new, arguments)
             return calls[0]["config"]
 
         self.assertEqual(parsed(), TrainConfig())
         self.assertEqual(RECIPES["default"].config, TrainConfig())
-        minutes = parsed("--recipe", "minutes", "--config.ppo.entropy", "0.001")
+        minutes = parsed("--recipe minutes --config.ppo.entropy 0.001")
         self.assertEqual(
             (minutes.ppo.desired_kl, minutes.ppo.entropy, minutes.model.initial_std),
             (0.02, 0.001, 0.3),
         )
-        robust = parsed("--recipe", "robust")
+        robust = parsed("--recipe robust")
         self.assertEqual(
             replace(robust, task=replace(robust.task, randomization=RandomizationConfig())),
             RECIPES["minutes"].config,
@@ -443,23 +441,18 @@ class TrainingTest(WithBank):
         lstm = replace(robust.model, lstm=256)
         self.assertEqual(replace(robust, model=lstm, iterations=2600), TrainConfig())
         self.assertEqual(
-            parsed(f"--recipe={self.out}", "--config.save-interval", "7"),
+            parsed(f"--recipe={self.out} --config.save-interval 7"),
             replace(CONFIG, save_interval=7),
         )
         for arguments, problem in (
             (
-                ("--recipe", "nothing"),
+                "--recipe nothing",
                 "no recipe, no file and no run folder 'nothing'. Recipes: default, .*; paper, the paper's tables",
             ),
-            (("--recipe", str(self.folder)), "is not a run folder"),
+            (f"--recipe {self.folder}", "is not a run folder"),
         ):
-            with (
-                self.subTest(arguments),
-                redirect_stderr(io.StringIO()) as said,
-                self.assertRaises(SystemExit),
-            ):
-                parsed(*arguments)
-            self.assertRegex(said.getvalue(), problem)
+            with self.subTest(arguments):
+                self.assertRegex(refused(new, arguments), problem)
 
     def test_without_data_a_run_continues_as_it_was_started(self):
         """Its length may change; other options are not ignored."""

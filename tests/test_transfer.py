@@ -378,11 +378,11 @@ class CommandTest(InFolder):
         return read_bank(path), config, out
 
     def test_everything_at_once(self):
-        press = ("--closing.spacing", "None", "--squeeze.force", "2.5")
-        plain, config, out = self.resets(*press, "--transfer.per-pose", "0")
+        press = "--closing.spacing None --squeeze.force 2.5"
+        plain, config, out = self.resets(press, "--transfer.per-pose 0")
         self.assertNotIn("grasps of other", out)
         self.enterContext(patch("xreset.resets.transfer._POSES", 2))
-        bank, config, out = self.resets(*press, "--transfer.per-pose", "1")
+        bank, config, out = self.resets(press, "--transfer.per-pose 1")
         self.assertEqual(config["transfer"], {"per_pose": 1})
         for words in (
             "3 states of 3 kept",

@@ -227,7 +227,7 @@ class Pictures(WithFiles):
         out = self.folder / "view.png"
         self.assertIn(
             "not valid: joint limit",
-            succeeds("view", self.retargeted, "--png", out, "--sequence", 1, "--frame", 1),
+            succeeds("view", self.retargeted, "--png", out, "--sequence 1 --frame 1"),
         )
         expected = self.folder / "expected.png"
         write_png(
@@ -235,10 +235,10 @@ class Pictures(WithFiles):
         )
         self.assertEqual(out.read_bytes(), expected.read_bytes())
         film = self.folder / "view.mp4"
-        self.assertIn("2 frames", succeeds("view", self.bank, "--mp4", film, "--sequence", 0))
+        self.assertIn("2 frames", succeeds("view", self.bank, "--mp4", film, "--sequence 0"))
         self.assertEqual(film.read_bytes()[4:8], b"ftyp")
         self.assertIn(
-            "Frame 4 does not exist", refused("view", self.retargeted, "--png", out, "--frame", 4)
+            "Frame 4 does not exist", refused("view", self.retargeted, "--png", out, "--frame 4")
         )
 
     def test_without_viser_the_message_says_what_to_install(self):

@@ -39,7 +39,7 @@ class WithBank(InOneFolder):
         """A command continues a run or, if there is a problem, prints it and does not."""
         run = refused if problem else succeeds
         with patch("xreset.learning.train.resume") as resumed:
-            self.assertRegex(run(*command.split()), problem or "^$")
+            self.assertRegex(run(command), problem or "^$")
         self.assertEqual(resumed.called, not problem)
 
 

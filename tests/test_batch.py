@@ -1,6 +1,6 @@
 """What :mod:`xreset.backends.batch` gives to engines that step all worlds at once, against the pool's numpy."""
 
-import unittest
+from unittest import TestCase
 
 import numpy as np
 import torch
@@ -61,7 +61,7 @@ def a_state(num_worlds):
     return start.map(lambda x: x + torch.arange(1, num_worlds + 1).float().view(-1, 1))
 
 
-class BatchTest(unittest.TestCase):
+class BatchTest(TestCase):
     def setUp(self):
         self.backend = Frozen(scene(), 4)
 
@@ -130,7 +130,7 @@ class BatchTest(unittest.TestCase):
         assert_close(self.backend.object_load()[:, 2], weight)
 
 
-class ReadingsTest(unittest.TestCase):
+class ReadingsTest(TestCase):
     def test_contacts_are_summed_as_in_a_pool(self):
         random = np.random.default_rng(3)
         tips = len(gripper().fingertips)
@@ -173,8 +173,3 @@ class ReadingsTest(unittest.TestCase):
         assert_allclose(matrix @ position + offset, expected[0])
         assert_allclose(matrix @ velocity, expected[1])
         self.assertNotEqual(len(matrix), len(position))  # a mimic joint follows
-
-
-if __name__ == "__main__":
-    torch.set_num_threads(1)
-    unittest.main()

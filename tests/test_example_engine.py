@@ -4,13 +4,12 @@ import importlib
 import re
 import sys
 import tomllib
-import unittest
 from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any, ClassVar
+from unittest import SkipTest, TestCase
 from unittest.mock import patch
 
-import torch
 from torch.testing import assert_close
 
 from tests.command import succeeds
@@ -37,7 +36,7 @@ def declared(engine):
     return EntryPoint(name=name, value=value, group=plugins.ENGINES)
 
 
-class Unavailable(unittest.TestCase):
+class Unavailable(TestCase):
     def assert_unavailable(self, engine, pattern):
         with self.assertRaisesRegex(BackendUnavailableError, pattern):
             make_backend(engine, scene(), 1)
@@ -146,7 +145,7 @@ class ExampleTest(Unavailable):
 
 
 class EngineTest:
-    """The quick checks of the suite, mixed into a ``unittest.TestCase``. Skipped where the engine is not installed."""
+    """The quick checks of the suite, mixed into a ``TestCase``. Skipped where the engine is not installed."""
 
     engine: ClassVar[str]
     checks: ClassVar[str]
@@ -157,7 +156,7 @@ class EngineTest:
         try:
             importlib.import_module(EXAMPLES[cls.engine])
         except ImportError:
-            raise unittest.SkipTest(
+            raise SkipTest(
                 f"{cls.engine} is not installed: pip install -e examples/xreset-{cls.engine}"
             ) from None
         cls.enterClassContext(patch.object(sys, "path", [str(folder_of(cls.engine)), *sys.path]))
@@ -174,7 +173,7 @@ class EngineTest:
             self.assertIn(known.check, {check.name for check in CHECKS})
 
 
-class NewtonTest(EngineTest, unittest.TestCase):
+class NewtonTest(EngineTest, TestCase):
     engine = "newton"
     checks = """
         state_round_trip links_after_set nothing_stays selected_worlds twins masked_set mass_properties free_spin
@@ -188,7 +187,7 @@ class NewtonTest(EngineTest, unittest.TestCase):
             self.make(scene(rough), 1)
 
 
-class DrakeTest(EngineTest, unittest.TestCase):
+class DrakeTest(EngineTest, TestCase):
     engine = "drake"
     options: ClassVar[dict[str, Any]] = {"workers": 0}
     checks = """
@@ -222,8 +221,3 @@ class DrakeTest(EngineTest, unittest.TestCase):
             backend.step()
             self.assertFalse(backend.health().nonfinite[0])
             assert_close(backend.state().object_pos, good.object_pos, atol=1e-3, rtol=0)
-
-
-if __name__ == "__main__":
-    torch.set_num_threads(1)
-    unittest.main()

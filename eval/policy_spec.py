@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING
 from xreset.errors import PolicyError
 from xreset.files.checks import Checked, Seed, frozen, obeys_rules
 from xreset.files.text import Brief, shown
-from xreset.geometry.description import load_robot, robot_of_file
+from xreset.geometry.description import load_robot
 from xreset.learning.exported import PolicyFile, find_policy
 from xreset.live.deploy import deployed_graph, is_deployed, made_for, training_of
 from xreset.objects.catalogue import object_names
+from xreset.physics.plugins import robot_of_file
 from xreset.policy.onnx_policy import (
     OnnxPolicy,
     Policy,

@@ -17,10 +17,9 @@ from tests.data import InFolder, refuses
 from tests.toy_retarget import FLOAT, arm_targets, double
 from xreset import robots, synthesize, write_demos
 from xreset.errors import RobotError
-from xreset.geometry.description import DESCRIPTION
 from xreset.geometry.description import load_robot as load
 from xreset.geometry.kinematics import Kinematics
-from xreset.physics.plugins import robot_folder
+from xreset.physics.plugins import DESCRIPTION, robot_folder
 from xreset.retarget.arm.config import ArmSearch
 from xreset.retarget.arm.model import ArmModel, ArmTargets
 from xreset.retarget.arm.solve import splice, spread_over, track

@@ -18,13 +18,11 @@ from typing import Any
 
 from xreset.errors import RobotError
 from xreset.files.checks import parsed
-from xreset.files.storage import read_toml, stated_path
+from xreset.files.storage import read_toml
 from xreset.geometry.urdf import mesh_files
-from xreset.physics.plugins import robot_folder, robot_names
+from xreset.physics.plugins import DESCRIPTION, robot_folder, robot_names
 from xreset.spec import RobotSpec
 
-DESCRIPTION = "robot.toml"
-"""Name of the description in a robot's folder."""
 SCHEMA = "xreset-robot/1"
 """What ``schema`` in the description must be."""
 
@@ -48,16 +46,6 @@ def load_robot(name_or_folder: str | Path | RobotSpec) -> RobotSpec:
             f"The package of the robot {name!r} calls it {spec.name!r} in robot.toml. Use one name in both."
         )
     return spec
-
-
-def robot_of_file(file: str | Path, *stated: str) -> str:
-    """Return the first name of a registered robot, or folder of another one, that a file states and that is here; see
-    :func:`stated_path`. If none is, the last one is returned."""
-    for robot in stated:
-        found = robot if robot in robot_names() else stated_path(robot, file, DESCRIPTION)
-        if found is not None:
-            return found
-    return stated[-1]
 
 
 def read_description(path: Path) -> RobotSpec:

@@ -27,9 +27,9 @@ from xreset.files.checks import (
 )
 from xreset.files.storage import read_json, stated_path, write_json
 from xreset.files.text import shown
-from xreset.geometry.description import robot_of_file
 from xreset.learning.clock import Lift, read_lift
 from xreset.learning.config import TrainConfig
+from xreset.physics.plugins import robot_of_file
 from xreset.task.contract import Contract
 
 SCHEMA = "xreset-run/1"

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from xreset.errors import BackendUnavailableError, RobotError, XResetError
 from xreset.files.checks import Check
+from xreset.files.storage import stated_path
 from xreset.files.text import shown
 
 if TYPE_CHECKING:
@@ -32,6 +33,8 @@ ENGINES = "xreset.backends"
 """Entry-point group of engines: ``name = "package.module:BackendClass"``."""
 ROBOTS = "xreset.robots"
 """Entry-point group of robots: ``name = "package.module"``, the module next to a ``robot.toml``."""
+DESCRIPTION = "robot.toml"
+"""Name of the description in a robot's folder."""
 _KINDS = {ENGINES: ("engine", BackendUnavailableError), ROBOTS: ("robot", RobotError)}
 """What messages call a plugin of a group, and the class of its errors."""
 
@@ -113,6 +116,16 @@ def robot_folder(name_or_folder: str | Path) -> Path:
             f"the robot {name!r}: {module!r} is not a module with a file; put an __init__.py next to its robot.toml."
         )
     return Path(module.__file__).resolve().parent
+
+
+def robot_of_file(file: str | Path, *stated: str) -> str:
+    """Return the first name of a registered robot, or folder of another one, that a file states and that is here; see
+    :func:`stated_path`. If none is, the last one is returned."""
+    for robot in stated:
+        found = robot if robot in robot_names() else stated_path(robot, file, DESCRIPTION)
+        if found is not None:
+            return found
+    return stated[-1]
 
 
 # Engines --------------------------------------------------------------------------------------------------------------

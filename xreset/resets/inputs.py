@@ -17,8 +17,9 @@ from xreset.files.progress import Progress, unseen
 from xreset.files.records import npz_schema, stated_meshes, stated_robot
 from xreset.files.storage import file_hash
 from xreset.files.text import shown
-from xreset.geometry.description import load_robot, robot_of_file
+from xreset.geometry.description import load_robot
 from xreset.objects.catalogue import canonical_names, load_objects, object_source
+from xreset.physics.plugins import robot_of_file
 from xreset.resets.bank import SCHEMA as BANK
 from xreset.resets.bank import (
     ResetBank,

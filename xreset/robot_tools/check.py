@@ -14,11 +14,11 @@ import torch
 from xreset.errors import RobotError, XResetError
 from xreset.files.text import quantity
 from xreset.geometry.collision import SelfCollision, table_clearance
-from xreset.geometry.description import DESCRIPTION, load_robot
+from xreset.geometry.description import load_robot
 from xreset.geometry.dynamics import damping_ratio, drive_inertia
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.urdf import RobotTree, load_urdf, mismatches
-from xreset.physics.plugins import robot_folder
+from xreset.physics.plugins import DESCRIPTION, robot_folder
 from xreset.retarget.hand.model import HandModel, predicted_gigabytes
 from xreset.robot_tools.draft import hand_side, link_places
 from xreset.robot_tools.opposition import heights_over_palm, opposition

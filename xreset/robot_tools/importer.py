@@ -19,13 +19,13 @@ from xreset.files.checks import frozen
 from xreset.files.storage import atomic_folder
 from xreset.files.text import listed, quantity
 from xreset.geometry.collision import SelfCollision
-from xreset.geometry.description import DESCRIPTION, load_robot
+from xreset.geometry.description import load_robot
 from xreset.geometry.dynamics import drive_inertia
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.shapes import roll_pitch_yaw, surface_of
 from xreset.geometry.urdf import Joint, RobotTree
 from xreset.geometry.urdf_writer import axes, pose
-from xreset.physics.plugins import robot_names
+from xreset.physics.plugins import DESCRIPTION, robot_names
 from xreset.robot_tools.check import MOST_TOUCHING, Finding, check, touching_itself
 from xreset.robot_tools.draft import description_text, draft_spec
 from xreset.robot_tools.fingers import Hand

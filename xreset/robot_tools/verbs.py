@@ -136,7 +136,8 @@ def place_robot(
     import numpy as np
 
     from xreset.demos.archive import demo_objects, read_demos, rest_on_table
-    from xreset.geometry.description import DESCRIPTION, load_robot, robot_folder
+    from xreset.geometry.description import load_robot
+    from xreset.physics.plugins import DESCRIPTION, robot_folder
     from xreset.retarget.pipeline import wrist_paths
     from xreset.robot_tools.place import place
 

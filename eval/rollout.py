@@ -161,7 +161,7 @@ def load_trial(
         policy: the policy, whose robot and task are taken.
         source: demonstrations, motion or a goal set, or a file of one of these; or a loaded bank. Objects of a goal set
             start as stated, because these starts are perturbed already; only the robot's joints are perturbed.
-        meshes: folder of object meshes; default: the folder of the policy's training.
+        meshes: folder of object meshes; default: the folder that the file states, else that of the policy's training.
         seed: seed of the perturbations.
         num_envs: worlds that run at the same time.
         episode_seconds: length of an episode [s]; default: as in the policy's training.
@@ -172,9 +172,12 @@ def load_trial(
     task = evaluation_task(policy.task)
     if episode_seconds is not None:
         task = with_episodes_of(task, episode_seconds)
-    folder = policy.meshes_folder(meshes)
     inputs = load_inputs(
-        source, robot=policy.robot, meshes=folder, accept=("demos", "motion", "goals")
+        source,
+        robot=policy.robot,
+        meshes=meshes,
+        else_meshes=policy.meshes,
+        accept=("demos", "motion", "goals"),
     )
     hashes = {} if policy.hash is None else {"policy": policy.hash}
     if inputs.hash is not None:
@@ -192,7 +195,7 @@ def load_trial(
         seed=seed,
         num_envs=num_envs,
         motion=inputs.motion() if policy.follows_motion else None,
-        meshes=folder,
+        meshes=inputs.meshes,
         inputs=hashes,
     )
 

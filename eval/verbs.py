@@ -70,7 +70,7 @@ def evaluate(
         episode_seconds: length of an episode [s], such as 12, as in the published paper; default: as in the policy's
             training.
         robot: name or folder of the robot; default: the policy's own. Baselines need it.
-        meshes: folder of real meshes; default: what the policy was trained with, else the stand-ins.
+        meshes: folder of real meshes; default: what the file states or the policy was trained with, else the stand-ins.
         seed: seed of the perturbations, which are the same in every engine.
         device: where engines run that can use a GPU: cpu or cuda.
         num_envs: worlds that run at the same time.
@@ -144,7 +144,7 @@ def stress(
         faults: change the faults of a robot by default, in place of physics.
         episodes: episodes of each demonstration, the same for every value.
         robot: name or folder of the robot; default: the policy's own. Baselines need it.
-        meshes: folder of real meshes; default: what the policy was trained with, else the stand-ins.
+        meshes: folder of real meshes; default: what the file states or the policy was trained with, else the stand-ins.
         seed: seed of starts and faults, which are the same in every engine.
         device: where engines run that can use a GPU: cpu or cuda.
         num_envs: worlds that run at the same time.
@@ -438,7 +438,7 @@ def play(
         robot: name or folder of the robot; default: the policy's own.
         demos: starts and goals: demonstrations, robot motion, reset states or a goal set; default: synthetic
             demonstrations.
-        meshes: folder of real meshes; default: what the policy was trained with, else the stand-ins.
+        meshes: folder of real meshes; default: what the file states or the policy was trained with, else the stand-ins.
         host: address to serve at; 0.0.0.0 allows other machines.
         port: port to serve at; if it is taken, the next free one.
 

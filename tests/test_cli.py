@@ -160,10 +160,17 @@ class UsageTest(TestCase):
             (r"--png is x\.xyz, expected a name that ends in \.png", "view d.npz --png x.xyz"),
             (r"--mp4 is x, expected a name that ends in \.mp4", "view d.npz --mp4 x"),
             (r"--picture is x\.jpg, expected", "robots check openarm --picture x.jpg"),
-            (r"Nothing was overwritten", "retarget d.npz --robot openarm --out ./d.npz"),
             (
-                r"--out is d\.npz, which is also one of the files",
+                r"--out is d\.npz, which the command reads\. Nothing was overwritten",
+                "retarget d.npz --robot openarm --out ./d.npz",
+            ),
+            (
+                r"--out is d\.npz, which the command reads",
                 "demos select c.npz d.npz --out ./d.npz",
+            ),
+            (
+                r"--out is e\.npz, which is --rest as well",
+                "demos select d.npz --share 0.5 --out e.npz --rest ./e.npz",
             ),
         ):
             with self.subTest(arguments[:80]):

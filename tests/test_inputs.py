@@ -15,6 +15,7 @@ from xreset import (
     Retargeted,
     evaluate,
     load_object,
+    load_policy,
     load_robot,
     make_bank,
     make_env,
@@ -28,6 +29,7 @@ from xreset import (
     write_retargeted,
 )
 from xreset.errors import DemoError, FileFormatError, RobotError, XResetError
+from xreset.eval.rollout import load_trial
 from xreset.files.storage import file_hash
 from xreset.resets.bank import check_objects, starts_and_goals
 from xreset.resets.config import GoalConfig
@@ -92,6 +94,8 @@ class InputsTest(InOneFolder):
         self.assertEqual((found.meshes, found.objects[0].source), (folder / "meshes", block.source))
         other = folder / "other"
         other.mkdir()
+        trained = replace(load_policy("zero", robot=self.robot.name), meshes=other)
+        self.assertEqual(load_trial(trained, file).meshes, folder / "meshes")
         trimesh.creation.box((0.06, 0.06, 0.12)).export(other / f"{SOUP}.obj")
         words = f"made with an imported mesh of {SOUP}, but the given one is another mesh.*--meshes"
         with self.assertRaisesRegex(FileFormatError, words):

@@ -183,7 +183,8 @@ class CollectTest(Reported):
                 self.assertEqual(len(notes), int(expected))
                 if expected:
                     self.assertRegex(
-                        notes[0], r"^0 % is expected here: in 10 iterations \(0.6 min\)"
+                        notes[0],
+                        r"^No object at its goal is expected: in 10 iterations \(0.6 min\)",
                     )
 
     def test_a_policy_that_sees_needs_no_run(self):

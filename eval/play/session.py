@@ -199,7 +199,11 @@ class Session:
         if self._demos is None:
             names = object_names(folder)
         else:
-            names = load_inputs(self._demos, robot=policy.robot, meshes=folder).bank.object_names
+            inputs = load_inputs(
+                self._demos, robot=policy.robot, meshes=self._folder, else_meshes=policy.meshes
+            )
+            folder = inputs.meshes
+            names = inputs.bank.object_names
         usual = ALIASES["soup"]
         name = canonical_name(object_name or (usual if usual in names else names[0]), names)
         source = self._demos or synthesize([name], STARTS, meshes=folder)

@@ -76,8 +76,9 @@ def expected(training: Training) -> list[str]:
     lift = training.lift
     if lift.iteration and not lift.passed:
         found.append(
-            f"0 % is expected here: in {lift.iteration:,} iterations ({lift.minutes:.2g} min), the training has not"
-            " once brought an object to its goal from home. Most trainings need minutes on a GPU for that."
+            f"No object at its goal is expected: in {lift.iteration:,} iterations ({lift.minutes:.2g} min), the"
+            " training has not once brought an object to its goal from home. Most trainings need minutes on a GPU for"
+            " that."
         )
     return found
 

@@ -248,8 +248,7 @@ def _check_overwriting(options: list[_Option]) -> None:
             files = other.value if several else [other.value]
             paths = [file.resolve() for file in files if isinstance(file, Path)]
             if other is not option and option.value.resolve() in paths:
-                which = "one of the" if several else "the"
+                use = f"is {other.flag} as well" if other.written else "the command reads"
                 raise XResetError(
-                    f"{option.flag} is {option.value}, which is also {which} {other.name.replace('_', ' ')}. "
-                    "Nothing was overwritten; choose another file."
+                    f"{option.flag} is {option.value}, which {use}. Nothing was overwritten; choose another file."
                 )

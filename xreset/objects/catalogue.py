@@ -135,7 +135,7 @@ def _mesh_of(name: str, meshes: str | Path) -> tuple[Path, str]:
         full = canonical_name(name, files)
     except ObjectError as error:
         raise ObjectError(
-            f"{error} These are the meshes in {meshes}; omit the folder for the built-in objects."
+            f"{error} These are the meshes in {meshes}: give another folder, or none for the built-in objects."
         ) from None
     return files[full], name if name in STAND_INS else full
 

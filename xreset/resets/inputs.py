@@ -119,6 +119,7 @@ def load_inputs(
     robot: str | Path | RobotSpec | None = None,
     objects: Sequence[ObjectSpec] | None = None,
     meshes: str | Path | None = None,
+    else_meshes: str | Path | None = None,
     only: Iterable[str] = (),
     accept: tuple[Kind, ...] = ("demos", "motion", "bank", "goals"),
 ) -> Inputs:
@@ -128,7 +129,8 @@ def load_inputs(
         source: file of ``xreset demos``, ``xreset retarget``, ``xreset resets`` or ``xreset goals``, or its content.
         robot: the robot, its name or its folder; default: the robot that the file names. Demonstrations name none.
         objects: the objects of robot motion, if they are loaded already.
-        meshes: folder of object meshes; default: the folder that the file states, else the built-in stand-ins.
+        meshes: folder of object meshes; default: the folder that the file states.
+        else_meshes: folder of meshes where the file states none; default: the built-in stand-ins.
         only: names of the objects to load; demonstrations of other objects are left out. Default: all objects.
         accept: the kinds of data that the caller can use.
 
@@ -150,6 +152,8 @@ def load_inputs(
     folder = Path(meshes) if meshes else None
     if folder is None and path is not None:
         folder = stated_meshes(path)
+    if folder is None and else_meshes:
+        folder = Path(else_meshes)
     names = data.object_names
     if only:
         names = tuple(dict.fromkeys(canonical_names(only, names)))

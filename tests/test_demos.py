@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from tests.command import refused, succeeds
 from tests.data import InFolder, data_dir, refuses
 from xreset import synthesize
-from xreset.demos import hand
+from xreset.demos import hand, synth
 from xreset.demos.archive import (
     demo_objects,
     grounded,
@@ -433,6 +433,26 @@ class Synthetic(InFolder):
             for array in ("hand_keypoints", "wrist_quat_wxyz", "object_pos", "object_quat_wxyz"):
                 self.assertEqual(getattr(a, array).tobytes(), getattr(b, array).tobytes())
         self.assertNotEqual(synthesize("soup", 1, seed=1).object_pos[0, 0], b.object_pos[0, 0])
+
+    def test_the_hand_turns_the_object_to_a_pose_in_which_people_end(self):
+        demos = synthesize(["soup"], 12, seed=0, side="both", fps=5)
+        first, last = demos.frame_offsets[:-1], demos.frame_offsets[1:] - 1
+        rotation = Rotation.from_quat(demos.object_quat_wxyz, scalar_first=True)
+        self.assertGreater(np.degrees((rotation[last] * rotation[first].inv()).magnitude()).max(), 100)
+        axes = Rotation.from_quat(demos.wrist_quat_wxyz[last], scalar_first=True).as_matrix()
+        mirror = np.where(demos.hand_side == "right", 1, -1)[:, None]
+        fingers, palm = -mirror * axes[..., 0], -axes[..., 1]
+        sideways = np.cross([0.0, 0.0, 1.0], fingers) * mirror  # to +x with a right hand
+        sideways /= np.linalg.norm(sideways, axis=1, keepdims=True)
+        up = np.cross(fingers, sideways) * mirror
+        angles = {
+            synth.GOAL_HEADING: np.arctan2(fingers[:, 0], -fingers[:, 1]),
+            synth.GOAL_PITCH: np.arcsin(fingers[:, 2]),
+            synth.GOAL_ROLL: np.arctan2((palm * up).sum(axis=1), (palm * sideways).sum(axis=1)),
+        }
+        places = dict(zip(synth.GOAL, demos.object_pos[last, :2].T, strict=True))
+        for bounds, values in (angles | places).items():
+            self.assertTrue(bounds[0] - 1e-5 < values.min() < values.max() < bounds[1] + 1e-5)
 
     def test_a_wall_of_ones_own_mesh_is_held_from_both_sides(self):
         trimesh.creation.annulus(0.0365, 0.04, 0.09, sections=16).export(self.folder / "tube.obj")

@@ -1,21 +1,22 @@
 """Writes the files of the policies that ship with xreset: ci/ship_policies.py [NAME=RUN ...]
 
-Without arguments it writes the deployed graphs, which is needed after the code of observations or actions has changed.
-NAME=RUN adds the policy of a run before, or replaces it, with its large weights in half precision. Measure the file
-that ships, and write its card. Graphs have the contract of the training that the policy's own file states.
+Without arguments it writes the deployed graphs anew, which is needed after the code of observations or actions has
+changed. NAME=RUN adds the policy of a run with its graph, or replaces them; large weights are stored in half precision.
+Measure the file that ships, and write its card. Graphs have the contract of the training that the policy's own file states.
 """
 
 from __future__ import annotations
 
 import json
 import sys
+from pathlib import Path
 
 import numpy as np
 import onnx
 from onnx import helper, numpy_helper
 
 from xreset.eval.policy_spec import load_policy
-from xreset.live.deploy import with_metadata
+from xreset.live.deploy import deployed_graph, with_metadata
 from xreset.policy.onnx_policy import METADATA_KEY, VERSION_KEY
 from xreset.policy.shipped import FOLDER, shipped
 
@@ -63,17 +64,19 @@ def without_weights(graph: bytes, network: bytes) -> bytes:
 
 
 def main() -> None:
-    for argument in sys.argv[1:]:
-        name, _, run = argument.partition("=")
+    made = {name: Path(run) for name, _, run in (given.partition("=") for given in sys.argv[1:])}
+    for name, run in made.items():
         (FOLDER / f"{name}.onnx").write_bytes(halved(load_policy(run).exported()))
     for name, file in shipped().items():
         policy = load_policy(file)
-        if policy.task.vision.cameras:
+        if policy.task.vision.cameras or (made and name not in made):
             continue
         stated = {entry.key: entry.value for entry in onnx.load(file).metadata_props}
         own = {key: stated[key] for key in (METADATA_KEY, VERSION_KEY) if key in stated}
-        graph = with_metadata(policy.graph, own)
-        file.with_suffix(".graph").write_bytes(without_weights(graph, file.read_bytes()))
+        # anew: policy.graph would be the one that ships
+        graph = deployed_graph(policy.exported(), policy.robot, policy.task)
+        content = without_weights(with_metadata(graph, own), file.read_bytes())
+        file.with_suffix(".graph").write_bytes(content)
         print(name)
 
 

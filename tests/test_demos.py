@@ -438,7 +438,9 @@ class Synthetic(InFolder):
         demos = synthesize(["soup"], 12, seed=0, side="both", fps=5)
         first, last = demos.frame_offsets[:-1], demos.frame_offsets[1:] - 1
         rotation = Rotation.from_quat(demos.object_quat_wxyz, scalar_first=True)
-        self.assertGreater(np.degrees((rotation[last] * rotation[first].inv()).magnitude()).max(), 100)
+        self.assertGreater(
+            np.degrees((rotation[last] * rotation[first].inv()).magnitude()).max(), 100
+        )
         axes = Rotation.from_quat(demos.wrist_quat_wxyz[last], scalar_first=True).as_matrix()
         mirror = np.where(demos.hand_side == "right", 1, -1)[:, None]
         fingers, palm = -mirror * axes[..., 0], -axes[..., 1]

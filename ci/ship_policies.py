@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import sys
-from pathlib import Path
 
 import numpy as np
 import onnx
@@ -64,9 +63,11 @@ def without_weights(graph: bytes, network: bytes) -> bytes:
 
 
 def main() -> None:
-    made = {name: Path(run) for name, _, run in (given.partition("=") for given in sys.argv[1:])}
-    for name, run in made.items():
+    made = set()
+    for argument in sys.argv[1:]:
+        name, _, run = argument.partition("=")
         (FOLDER / f"{name}.onnx").write_bytes(halved(load_policy(run).exported()))
+        made.add(name)
     for name, file in shipped().items():
         policy = load_policy(file)
         if policy.task.vision.cameras or (made and name not in made):

@@ -436,14 +436,14 @@ class Synthetic(InFolder):
 
     def test_the_hand_turns_the_object_to_a_pose_in_which_people_end(self):
         demos = synthesize(["soup"], 12, seed=0, side="both", fps=5)
-        first, last = demos.frame_offsets[:-1], demos.frame_offsets[1:] - 1
+        last = demos.frame_offsets[1:] - 1
         rotation = Rotation.from_quat(demos.object_quat_wxyz, scalar_first=True)
-        self.assertGreater(
-            np.degrees((rotation[last] * rotation[first].inv()).magnitude()).max(), 100
-        )
+        turn = rotation[last] * rotation[demos.frame_offsets[:-1]].inv()
+        self.assertGreater(np.degrees(turn.magnitude()).max(), 100)
         axes = Rotation.from_quat(demos.wrist_quat_wxyz[last], scalar_first=True).as_matrix()
         mirror = np.where(demos.hand_side == "right", 1, -1)[:, None]
-        fingers, palm = -mirror * axes[..., 0], -axes[..., 1]
+        fingers = -mirror * axes[..., 0]
+        palm = -axes[..., 1]
         sideways = np.cross([0.0, 0.0, 1.0], fingers) * mirror  # to +x with a right hand
         sideways /= np.linalg.norm(sideways, axis=1, keepdims=True)
         up = np.cross(fingers, sideways) * mirror

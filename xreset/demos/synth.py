@@ -231,27 +231,29 @@ def _object_path(
     Returns:
         Positions [T, 3] and T orientations.
     """
-    pos, rest = grasp.solid.pos, grasp.solid.rotation
+    pos = grasp.solid.pos
     goal = np.array([rng.uniform(*GOAL[0]), rng.uniform(*GOAL[1]), pos[2] + rng.uniform(*LIFT)])
     turn = _hand_at_goal(side, rng) * grasp.wrist_rot.inv()
     _, _, lift, end, last = timing
     frame = np.arange(last + 1)
     rise = _minimum_jerk(frame, lift, end)
     turned = _minimum_jerk(frame, lift + 0.2 * (end - lift), end)  # clear of the table
-    object_rot = Rotation.from_rotvec(turned[:, None] * turn.as_rotvec()) * rest
+    object_rot = Rotation.from_rotvec(turned[:, None] * turn.as_rotvec()) * grasp.solid.rotation
     return pos + rise[:, None] * (goal - pos), object_rot
 
 
 def _hand_at_goal(side: str, rng: np.random.Generator) -> Rotation:
     """Draw the wrist's orientation at the goal: people turn their palm about a forearm that points away from them."""
-    heading, pitch, roll = (
-        rng.uniform(*bounds) for bounds in (GOAL_HEADING, GOAL_PITCH, GOAL_ROLL)
-    )
+    heading = rng.uniform(*GOAL_HEADING)
+    pitch = rng.uniform(*GOAL_PITCH)
+    roll = rng.uniform(*GOAL_ROLL)
     level = np.array([np.sin(heading), -np.cos(heading), 0.0])
     fingers = np.cos(pitch) * level + np.sin(pitch) * np.array(_Z)
-    sideways = np.cross(_Z, level)
+    sideways = np.cross(_Z, level)  # +x, where a right hand's palm faces
     up = np.cross(fingers, sideways)
-    palm = np.cos(roll) * (sideways if side == "right" else -sideways) + np.sin(roll) * up
+    if side == "left":
+        sideways = -sideways
+    palm = np.cos(roll) * sideways + np.sin(roll) * up
     return Rotation.from_matrix(hand.hand_axes(fingers, palm, side))
 
 

@@ -458,6 +458,16 @@ class MeshImport(InFolder):
             with refuses(self, message, ObjectError):
                 import_with_notes(path, "bad")
 
+    def test_the_unit_is_checked_before_a_mesh_is_cut(self):
+        path = self.folder / "025_mug.obj"
+        mug = CUBE.copy().apply_scale(10)
+        mug.update_faces(np.arange(len(mug.faces)) > 1)
+        mug.export(path)
+        with patch("xreset.objects.meshes.cached_pieces") as cut:
+            with self.assertRaisesRegex(ObjectError, "measures 1 x 1 x 1 m, so 0.118 kg are"):
+                import_with_notes(path, "025_mug")
+            cut.assert_not_called()
+
     def test_layouts(self):
         self.write(CUBE, "011_banana")
         for name in ("025_mug/textured", "025_mug/textured_simple", "024_bowl/textured"):

@@ -105,13 +105,18 @@ def import_with_notes(path: str | Path, name: str) -> Import:
     notes = []
     mesh = _without_specks(read_mesh(path), notes)
     own = properties_of(path)
+    known = _known_mass(name, own)
     source = file_hash(path)
     cut = " ".join((source, *notes))  # earlier versions cut specks, too
     try:
+        if known is not None:
+            _check_density(mesh, known[0])  # at once: cutting takes up to a minute
         settings = Settings()
         if own.tolerance is not None:
             settings = Settings(hull_depth=0.0, tolerance=own.tolerance)
         pieces = cached_pieces(mesh, cut, settings)
+        if known is None:
+            _check_density(mesh, _density(own) * pieces.volume)
     except ObjectError as error:
         raise ObjectError(f"{path}: {error}") from error
     except QhullError as error:
@@ -120,8 +125,7 @@ def import_with_notes(path: str | Path, name: str) -> Import:
         ) from error
     if not mesh.is_volume:
         notes.append(_how_closed(mesh, pieces))
-    mass, mass_source = _mass(path, name, own, pieces.volume, notes)
-    _check_density(path, mesh, mass)
+    mass, mass_source = known or _guessed_mass(path, own, pieces.volume, notes)
     com = pieces.com
     inertia = pieces.inertia * mass
     if own.density is None and mesh.is_volume and mass / pieces.volume < _HOLLOW:
@@ -155,17 +159,26 @@ def import_with_notes(path: str | Path, name: str) -> Import:
     )
 
 
-def _mass(
-    path: Path, name: str, own: Properties, volume: float, notes: list[str]
-) -> tuple[float, str]:
-    """Return an object's mass [kg] and its source in words; a guess is noted. The volume is that of the solid [m^3]."""
+def _known_mass(name: str, own: Properties) -> tuple[float, str] | None:
+    """Return an object's stated or published mass [kg] and its source in words; None if its density decides."""
     if own.mass is not None:
         return own.mass, "stated"
-    density = own.density
-    if density is None:
-        if name in PUBLISHED_MASSES:
-            return PUBLISHED_MASSES[name], "published (YCB)"
-        density = DEFAULT_DENSITY
+    if own.density is None and name in PUBLISHED_MASSES:
+        return PUBLISHED_MASSES[name], "published (YCB)"
+    return None
+
+
+def _density(own: Properties) -> float:
+    """Return the stated or guessed density [kg/m^3]."""
+    return DEFAULT_DENSITY if own.density is None else own.density
+
+
+def _guessed_mass(
+    path: Path, own: Properties, volume: float, notes: list[str]
+) -> tuple[float, str]:
+    """Return the mass [kg] of a solid of a volume [m^3] and its source in words; a guessed density is noted."""
+    density = _density(own)
+    if own.density is None:
         notes.append(
             f"its mass is unknown: {density * volume:.3g} kg is assumed, by a density of"
             f" {density:.0f} kg/m^3. State `mass` in {path.with_suffix('.toml').name}"
@@ -173,14 +186,14 @@ def _mass(
     return density * volume, f"{density:g} kg/m^3"
 
 
-def _check_density(path: Path, mesh: trimesh.Trimesh, mass: float) -> None:
+def _check_density(mesh: trimesh.Trimesh, mass: float) -> None:
     """Refuse, with ``ObjectError``, a mesh of another unit or a mass that no object of its size has."""
     # an open mesh is at most as large as its convex hull
     density = mass / (mesh if mesh.is_volume else mesh.convex_hull).volume
     if MASSES[0] <= mass <= MASSES[1] and DENSITIES[0] <= density <= DENSITIES[1]:
         return
     raise ObjectError(
-        f"{path} measures {_size(mesh)}, so {mass:.3g} kg are {density:.3g} kg/m^3; expected {MASSES[0]:g} to"
+        f"it measures {_size(mesh)}, so {mass:.3g} kg are {density:.3g} kg/m^3; expected {MASSES[0]:g} to"
         f" {MASSES[1]:g} kg, and {DENSITIES[0]:g} to {DENSITIES[1]:g} kg/m^3. Is the mesh in metres? If not: xreset"
         " objects import MESH --scale."
     )

@@ -17,7 +17,7 @@ from xreset.demos.archive import demo_objects
 from xreset.demos.examine import examine, surfaces_of
 from xreset.demos.keypoints import read_keypoints
 from xreset.errors import DemoError
-from xreset.geometry.shapes import quat_of
+from xreset.geometry.shapes import hull, quat_of
 from xreset.geometry.surface import prepared_surface
 from xreset.objects.rest import rest_height
 
@@ -128,6 +128,52 @@ class Wrong(InFolder):
                 self.assertRegex(said, CAUSES.get(name, "^"), name)
         self.assertLess(len(silent), 8, silent)
         self.assertLessEqual({name.partition(" along")[0] for name in silent}, SILENT)
+
+    def test_a_height_that_is_a_little_wrong_is_no_other_convention(self):
+        """Before, an order of the quaternions or inverse orientations were named, and refused."""
+        meshes = data_dir() / "ycb20"
+        for archive, name in (
+            ("right_9x20", "20200709-subject-01/20200709_142926"),
+            ("right_9x20", "20200820-subject-03/20200820_140454"),
+            ("right_11x20", "20200908-subject-05/20200908_145254"),
+        ):
+            demos = read_demos(data_dir() / f"dexycb_{archive}.npz").select(names=[name])
+            known = surfaces_of(demos, meshes)
+            up = np.float32([0.0, 0.0, 0.02])
+            raised = replace(demos, object_pos=demos.object_pos + up)
+            with self.subTest(name):
+                (found,) = examine(raised, known)
+                self.assertFalse(found.wrong)
+                self.assertRegex(str(found), "The object starts .* mm above the table")
+                self.assertNotRegex(str(found), "order|inverted")
+
+    def test_orders_of_quaternions_of_round_and_flat_objects(self):
+        """The slip alone does not tell these; lean, depth and height do."""
+        meshes = data_dir() / "ycb20"
+        for archive, name, shift, order in (
+            ("right_9x20", "20200820-subject-03/20200820_140158", -1, "(x, y, z, w)"),
+            ("right_9x20", "20200908-subject-05/20200908_144439", -1, "(x, y, z, w)"),
+            ("right_9x20", "20200908-subject-05/20200908_144342", 1, "(w, x, y, z)"),
+            ("right_11x20", "20201022-subject-10/20201022_112255", 1, "(w, x, y, z)"),
+        ):
+            demos = read_demos(data_dir() / f"dexycb_{archive}.npz").select(names=[name])
+            quats = np.roll(demos.object_quat_wxyz, shift, axis=1)
+            with self.subTest(name):
+                known = surfaces_of(demos, meshes)
+                (found,) = examine(replace(demos, object_quat_wxyz=quats), known)
+                self.assertTrue(found.wrong)
+                self.assertIn(order, found.cause)
+
+    def test_mesh_in_another_unit(self):
+        demos = synthesize(["soup"], 1, seed=1)
+        ((name, obj),) = demo_objects(demos).items()
+        for scale, words in ((3.2808, "0.3048 times as large"), (0.1, "10 times as large")):
+            corners = scale * obj.vertices
+            scaled = replace(obj, vertices=corners, com=scale * obj.com, pieces=(hull(corners),))
+            with self.subTest(scale):
+                (found,) = examine(demos, {name: prepared_surface(scaled)})
+                self.assertTrue(found.wrong)
+                self.assertIn(words, found.cause)
 
     def test_what_only_the_shape_or_the_whole_motion_tells(self):
         demos = synthesize(["soup"], 1, seed=1)

@@ -237,7 +237,7 @@ def _of_place(r: Recording) -> Iterator[Finding]:
         cause, certain = likeliest_cause(r)
         yield Finding(
             name="place",
-            wrong=certain or any(contradiction.wrong for contradiction in found),
+            wrong=certain or r.is_wrong,
             found=f"{sentence[0].upper()}{sentence[1:]}.",
             cause=cause,
         )

@@ -178,8 +178,10 @@ def make_goals(
     from xreset.resets.goals import drawn_goals, write_goals
 
     config = config or GoalConfig()
-    spec = load_robot(robot)
-    found = drawn_goals(load_objects(names, meshes), spec, families, poses, config, progress)
+    found = drawn_goals(
+        load_objects(names, meshes), load_robot(robot), families, poses, config, progress
+    )
     if out is not None:
-        write_goals(out, found, config, robot=spec.name if spec is robot else robot, meshes=meshes)
+        stated = robot if isinstance(robot, str | Path) else None
+        write_goals(out, found, config, robot=stated, meshes=meshes)
     return found

@@ -8,7 +8,7 @@ import sys
 import threading
 import tracemalloc
 import zipfile
-from contextlib import contextmanager
+from contextlib import chdir, contextmanager
 from dataclasses import asdict, dataclass, replace
 from errno import EACCES, EMFILE, ENOSPC
 from typing import ClassVar, Literal
@@ -42,6 +42,7 @@ from xreset.files.storage import (
     code_version,
     read_json,
     read_toml,
+    stated_path,
     write_json,
 )
 
@@ -210,6 +211,21 @@ class ClaimTest(InFolder):
         self.addCleanup(end.join)
         with claim(self.folder):
             pass
+
+
+class StatedPathTest(InFolder):
+    def test_the_working_folder_comes_before_those_above_the_file(self):
+        """Before, a file of the same name in the run's folder was taken."""
+        run = self.folder / "runs" / "a"
+        run.mkdir(parents=True)
+        (run / "resets.npz").touch()
+        self.enterContext(chdir(self.folder))
+        self.assertEqual(
+            stated_path("resets.npz", run / "run.json"), str(run.resolve() / "resets.npz")
+        )
+        (self.folder / "resets.npz").touch()
+        self.assertEqual(stated_path("resets.npz", run / "run.json"), "resets.npz")
+        self.assertIsNone(stated_path("other.npz", run / "run.json"))
 
 
 class JsonTest(InFolder):

@@ -400,10 +400,12 @@ def file_hash(path: str | Path) -> str:
 def stated_path(stated: str, file: str | Path, content: str = "") -> str | None:
     """Return a file or folder that another file states, or None if it is gone. It may be relative to the working folder
     or to one of the folders above that file. ``content``: what a folder must have."""
-    places = (Path(), *Path(file).resolve().parents)
-    found = (place / stated for place in places if os.path.exists(place / stated / content))
-    path = next(found, None)
-    return None if path is None else str(path)
+    if os.path.exists(Path(stated) / content):
+        return stated
+    for place in Path(file).resolve().parents:
+        if os.path.exists(place / stated / content):
+            return str(place / stated)
+    return None
 
 
 def must_exist(path: Path, what: str) -> None:

@@ -18,16 +18,14 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from xreset.errors import DemoError
-from xreset.files.checks import PositiveInt, frozen, obeys_rules
+from xreset.files.checks import frozen
 from xreset.files.processes import batches
-from xreset.files.progress import unseen
-from xreset.files.text import quantity
+from xreset.files.progress import Progress
 from xreset.geometry.collision import object_depth
 from xreset.geometry.rotations import matrix_to_quat, quat_angle
 from xreset.geometry.shapes import turn_of
 from xreset.physics import Backend, State
-from xreset.resets.bank import ResetBank, check_states
+from xreset.resets.bank import ResetBank
 from xreset.resets.config import TransferConfig
 from xreset.resets.grasps import carried
 from xreset.resets.probe import probe
@@ -36,7 +34,7 @@ from xreset.retarget.arm.model import ArmModel, ArmTargets
 from xreset.retarget.arm.solve import track_each
 from xreset.retarget.file import Retargeted
 from xreset.retarget.validity import Thresholds, classify
-from xreset.spec import ObjectSpec, RobotSpec, SceneSpec, checked_objects, objects_named
+from xreset.spec import ObjectSpec, RobotSpec, SceneSpec, objects_named
 
 # These limits were measured together (docs/lab-book.md, "Grasps of other demonstrations"), and none was varied.
 _RAISED = 0.03
@@ -78,17 +76,16 @@ class _Poses:
     """[W, 4]"""
 
 
-@obeys_rules
 def add_transfers(
     bank: ResetBank,
     retargeted: Retargeted,
     robot: RobotSpec,
     objects: Sequence[ObjectSpec],
-    config: TransferConfig = TransferConfig(),
+    config: TransferConfig,
     *,
-    num_envs: PositiveInt = 64,
-    device: str = "cpu",
-    progress: Callable[[float, int], None] = unseen,
+    num_envs: int,
+    device: str,
+    progress: Progress,
 ) -> ResetBank:
     """Return a bank with more states: grasps of other demonstrations of the same object, at poses of each
     demonstration. The arguments determine the result.
@@ -98,26 +95,17 @@ def add_transfers(
     demonstration gets no state, and so does a bank without a state that presses on an object in the air.
 
     Args:
-        bank: made by ``make_bank(transfer=None)``. The hand must hold the object in every engine of the bank.
-        retargeted: the motion that the bank was made from.
+        bank: made from ``retargeted``. The hand must hold the object in every engine of the bank.
+        retargeted: the motion.
         robot: the robot of both.
         objects: the objects of both.
         config: how many states.
         num_envs: worlds at a time.
         device: where engines run that can use it; the others run on the CPU.
         progress: called with what is done and what is to be done in all.
-
-    Raises:
-        DemoError: the bank has transferred states already, the motion has other demonstrations than the bank, or an
-            object is not among ``objects``.
-        FileFormatError: the bank's states are for a robot with other joints, or for other meshes.
-        XResetError: coal, which retargeting needs too, is not installed.
     """
-    objects = checked_objects(robot, objects)
-    check_states(bank, robot, tuple(objects))
-    if not config.per_pose:
-        return bank
-    grasps = _grasps(bank, retargeted, robot)
+    start_pos, _ = retargeted.start_pose
+    grasps = np.flatnonzero(carried(bank, robot, start_pos[:, 2]))
     if not len(grasps):
         return bank
     poses = _raised_poses(retargeted)
@@ -207,23 +195,6 @@ def _holding(
         )
         held = held[holds]
     return states[torch.as_tensor(held)], held, depth[held]
-
-
-def _grasps(bank: ResetBank, retargeted: Retargeted, robot: RobotSpec) -> np.ndarray:
-    """Return the states of the bank, ascending, whose hands press on an object in the air; errors as in
-    :func:`add_transfers`."""
-    if not np.array_equal(bank.sequence_name, retargeted.sequence_name):
-        raise DemoError(
-            f"The bank has {quantity(len(bank.sequence_name), 'demonstration')}, and they are not the "
-            f"{len(retargeted.sequence_name)} of the motion. Give the motion that the bank was made from."
-        )
-    if not bank.own_grasp.all():
-        raise DemoError(
-            f"The bank already has {quantity((~bank.own_grasp).sum(), 'state')} in grasps of other demonstrations. "
-            "Give the bank that xreset.make_bank returned."
-        )
-    start_pos, _ = retargeted.start_pose
-    return np.flatnonzero(carried(bank, robot, start_pos[:, 2]))
 
 
 def _raised_poses(retargeted: Retargeted) -> _Poses:
@@ -352,6 +323,7 @@ def _joined(
         "sequence_index": sequence.astype(bank.sequence_index.dtype),
         "frame_index": poses.frame[pose].astype(bank.frame_index.dtype),
         "post_contact": np.ones(count, dtype=bool),
+        "object_depth": depth.astype(np.float32),
         "transferred": np.ones(count, dtype=bool),
     }
     own = {name: getattr(bank, name) for name in added}
@@ -359,8 +331,5 @@ def _joined(
     if bank.frame_part is not None:
         own["frame_part"] = bank.frame_part
         added["frame_part"] = np.zeros(count, dtype=np.float32)
-    if bank.object_depth is not None:
-        own["object_depth"] = bank.object_depth
-        added["object_depth"] = depth.astype(np.float32)
     joined = {name: np.concatenate((own[name], values)) for name, values in added.items()}
     return replace(bank, **joined)

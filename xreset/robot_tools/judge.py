@@ -33,7 +33,7 @@ from xreset.geometry.rotations import (
 )
 from xreset.physics import Backend, State
 from xreset.pictures.render import Camera, Renderer, add_caption
-from xreset.resets.bank import ResetBank, check_states
+from xreset.resets.bank import ResetBank
 from xreset.resets.config import SqueezeConfig
 from xreset.resets.fingers import Fingers, fingers_of, squeeze_targets
 from xreset.resets.grasps import losses
@@ -143,7 +143,6 @@ def try_grasps(
     progress: Progress,
 ) -> Judgement:
     """Try the states of a bank, and count the demonstrations in reach; see :func:`xreset.robot_tools.verbs.judge`."""
-    check_states(bank, robot, tuple(objects))
     tried, start = _grasps(bank, robot, objects, states, squeeze)
     count = tried.num_states
     used = [spec for spec in objects if spec.name in tried.object_name]

@@ -111,7 +111,7 @@ def _play_in(
 
         controller = Controller(policy.graph, policy.name)
     for i, condition in enumerate(played):
-        changed = replace(trial, task=condition.task)
+        changed = _under(condition, trial)
         if controller is None:
             rollouts = roll_out(
                 policy.start(trial.motion),
@@ -153,6 +153,14 @@ def _play_in(
         episodes=pd.concat(tables, ignore_index=True),
     )
     return result, traces
+
+
+def _under(condition: Condition, trial: Trial) -> Trial:
+    """Return what is played under a condition. A changed friction replaces those that objects have of their own."""
+    objects = trial.objects
+    if property_of(condition.property).changed_field == "friction":
+        objects = tuple(replace(each, friction=None) for each in objects)
+    return replace(trial, task=condition.task, objects=objects)
 
 
 def _length(trial: Trial) -> float:

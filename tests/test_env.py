@@ -2,6 +2,8 @@
 
 from dataclasses import replace
 from itertools import product
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import SimpleNamespace
 from unittest import TestCase
 from unittest.mock import patch
@@ -24,7 +26,10 @@ from xreset.backends.mujoco import MujocoBackend
 from xreset.env.manipulation import ManipulationEnv, make_env, make_scene
 from xreset.errors import CapabilityError, XResetError
 from xreset.eval.baselines import KinematicRetargeting, ZeroPolicy
+from xreset.eval.conditions import Condition, chosen_properties, nominal_task
+from xreset.eval.experiment import play
 from xreset.eval.metrics import EpisodeMetrics, MetricPoints
+from xreset.eval.policy_spec import PolicySpec
 from xreset.eval.rollout import Engine, Trial, roll_out
 from xreset.geometry.rotations import quat_rotate
 from xreset.learning.recipes import RECIPES
@@ -701,6 +706,38 @@ class RolloutTest(WithEnv):
             self.assertGreater(np.abs(difference).max(axis=1).min(), 1e-4)
         away = np.abs(found - self.bank.start_pos[[0, 0, 2, 2, 1, 1]])
         self.assertTrue(0 < away[:, :2].max() <= 0.02 and away[:, 2].max() < 1e-6)
+
+    def test_a_changed_friction_replaces_an_objects_own(self):
+        """Else a sweep of the friction would change nothing for objects that state theirs."""
+        seen = []
+
+        class Watching(ZeroPolicy):
+            def begin(self, env):
+                seen.append(env.variation.parameters["friction"][:, 0].tolist())
+
+        def make(scene, num_worlds, object_index):
+            return MujocoBackend(scene, num_worlds, workers=0, object_index=object_index)
+
+        def start(motion):
+            return Watching(7)
+
+        soup, spam = self.objects
+        objects = (replace(soup, friction=0.3), spam)
+        task = nominal_task(self.TASK)
+        parts = {"robot": self.robot, "objects": objects, "bank": self.bank, "task": task}
+        (friction,) = chosen_properties("object-friction")
+        with TemporaryDirectory() as folder:
+            play(
+                PolicySpec(name="zero", start=start, robot=self.robot, task=TASK, folder=folder),
+                Trial(**parts, num_envs=2),
+                [Engine(name="mujoco", make=make, version="")],
+                [Condition(task=task), friction.at(0.9, task)],
+                Path(folder),
+                episodes=1,
+            )
+        # of fingertips: the mean of the object's material and the elastomer, which has 0.8
+        assert_allclose(seen[0], [(0.3 + 0.8) / 2, (0.75 + 0.8) / 2])
+        assert_allclose(seen[-1], [(0.9 + 0.8) / 2] * 2)
 
     def test_a_world_that_breaks_down_is_reported_and_the_others_go_on(self):
         class BreaksOnce(BreakableBackend):

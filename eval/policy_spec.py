@@ -27,7 +27,7 @@ from xreset.policy.shipped import graph_of, no_policy_for, shipped_name
 from xreset.resets.bank import ResetBank
 from xreset.retarget.file import Retargeted
 from xreset.runtime import Controller
-from xreset.spec import ObjectSpec, RobotSpec
+from xreset.spec import ObjectSpec, RobotSpec, first_difference
 from xreset.task.config import TaskConfig, evaluation_task
 from xreset.task.contract import Contract
 
@@ -225,9 +225,10 @@ def load_policy(policy: str | Path | PolicySpec, *, robot: str | Path | None = N
     elif contract.joint_names != spec.joint_names:
         if contract.robot != spec.name:
             raise of_another_robot(str(found.path), contract.robot, spec.name)
+        differs = first_difference(contract.joint_names, spec.joint_names)
         raise PolicyError(
-            f"{found.path} has the joints {', '.join(contract.joint_names)}, but the robot {spec.name!r} has "
-            f"{', '.join(spec.joint_names)}."
+            f"{found.path} is a policy of another version of {spec.name!r}: {differs}. Export the policy again, or "
+            "use the robot's former version."
         )
     results = found.results
     if contract.task.joint_slots is not None and spec.name != contract.robot:

@@ -34,6 +34,7 @@ from xreset.files.checks import (
 from xreset.files.records import POSITION, UNIT_TOLERANCE, Field, read_npz, write_npz
 from xreset.files.storage import check_schema, read_json, write_json
 from xreset.files.text import Brief, shown
+from xreset.spec import first_difference
 
 SCHEMA = "xreset-eval/2"
 EARLIER_SCHEMA = "xreset-eval/1"
@@ -447,7 +448,7 @@ def read_traces(
     found = tuple(arrays["joint_names"].tolist())
     if joint_names is not None and found != joint_names:
         raise FileFormatError(
-            f"{path} is a trace of the joints {', '.join(found)}; the robot has {', '.join(joint_names)}. "
+            f"{path} is a trace of other joints than the robot's: {first_difference(found, joint_names)}. "
             "Evaluate again."
         )
     traces = []

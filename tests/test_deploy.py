@@ -155,6 +155,15 @@ class ToyTest(InFolder):
             object_pos=[0.5, 0.3, 0.1], object_quat=[1, 0, 0, 0], object_time=0.0,
         )  # fmt: skip
 
+    def test_a_robot_with_other_joints_is_refused(self):
+        changed = replace(self.robot, joints=self.robot.joints[:-1])
+        words = "another version of 'conformance-gripper': joint_names.4. is '.*', here missing"
+        with (
+            mock.patch("xreset.eval.policy_spec.load_robot", return_value=changed),
+            self.assertRaisesRegex(PolicyError, words),
+        ):
+            load_policy(self.out / "policy.onnx", robot="changed")
+
     def test_the_graph_says_what_goes_in_and_out(self):
         model = onnx.load_from_string(self.graph)
         onnx.checker.check_model(model)

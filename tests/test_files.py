@@ -45,6 +45,7 @@ from xreset.files.storage import (
     stated_path,
     write_json,
 )
+from xreset.spec import check_robot
 
 SCHEMA = {
     "points": Field(("F", 3), "f"),
@@ -646,6 +647,19 @@ class BankTest(InFolder):
         )
         with self.refused("another version of 'toy'", "Make it again"):
             read_bank(self.file, robot=self.robot)
+
+    def test_a_bank_of_other_joints_names_the_first(self):
+        names = [*self.robot.joint_names]
+        for index, found, here, joints in (
+            (1, "'finger'", f"'{names[1]}'", (names[0], "finger", *names[2:])),
+            (6, "missing", f"'{names[6]}'", names[:6]),
+            (7, "'eighth'", "missing", (*names, "eighth")),
+        ):
+            self.write()
+            bank = replace(read_bank(self.file), joint_names=tuple(joints))
+            words = f"version of 'toy': joint_names\\[{index}\\] is {found}, here {here}"
+            with self.refused(words, "Make it again"):
+                check_robot(self.file, "reset bank", bank, self.robot)
 
     def test_bad_content(self):
         bank = toy_bank(self.robot)

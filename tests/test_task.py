@@ -1367,11 +1367,13 @@ class PolicyTest(TestCase):
         layout = policy_contract(self.robot, self.TASK, ()).observation_layout
         tactile = layout | {"policy": layout["policy"] | {"tactile": 4}}
         robot = "a policy of the robot 'openarm', not of 'toy': use 'openarm', or another policy"
+        first, second, *_, last = self.robot.joint_names
+        order = f"joint order .joint_names.0.: '{last}', here '{first}'; .*, here '{second}'.*; and . more"
         schema = "schema is 'xreset-policy/9', expected one of 'xreset-policy/1'"
         for words, name, value in (
             (robot, "robot", "openarm"),
             (schema, "schema", "xreset-policy/9"),
-            ("another joint order", "joint_names", list(reversed(self.robot.joint_names))),
+            (order, "joint_names", list(reversed(self.robot.joint_names))),
             ("another fingertips", "fingertip_names", ["index", "thumb"]),
             ("another version of the robot", "robot_fingerprint", "00"),
             ("another version of the robot", "robot_fingerprint", ""),

@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterable, Sequence
 from dataclasses import field, fields, replace
+from itertools import zip_longest
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -26,7 +27,7 @@ from xreset.files.checks import (
     Text,
     frozen,
 )
-from xreset.files.text import Brief, quantity, shown
+from xreset.files.text import Brief, shown
 
 GRAVITY = 9.81
 """Magnitude of gravity in m/s^2; it points along -z."""
@@ -371,17 +372,27 @@ def check_robot(path: str | Path, what: str, data: Any, robot: RobotSpec) -> Non
     Raises:
         FileFormatError: the data do not fit.
     """
-    if data.robot != robot.name or data.joint_names != robot.joint_names:
+    if data.robot != robot.name:
         raise FileFormatError(
-            f"{path} is a {what} for the robot {data.robot!r} with {quantity(len(data.joint_names), 'joint')}; "
-            f"{robot.name!r} has {len(robot.joints)}. Make it again for {robot.name!r}, or use the robot "
-            f"{data.robot!r}."
+            f"{path} is a {what} for the robot {data.robot!r}, not for {robot.name!r}. Make it again for "
+            f"{robot.name!r}, or use the robot {data.robot!r}."
         )
-    if not robot.has_fingerprint(data.robot_fingerprint):
+    changed = first_difference(data.joint_names, robot.joint_names)
+    if not changed and not robot.has_fingerprint(data.robot_fingerprint):
+        changed = "its URDF, a mesh or robot.toml has changed"
+    if changed:
         raise FileFormatError(
-            f"{path} is a {what} for another version of {data.robot!r}: its URDF or robot.toml has changed. Make it "
-            "again."
+            f"{path} is a {what} for another version of {data.robot!r}: {changed}. Make it again."
         )
+
+
+def first_difference(found: Sequence[str], needed: Sequence[str]) -> str:
+    """Return where the joints of a file first differ from those of a robot, as a text; empty if they are equal."""
+    for i, (one, other) in enumerate(zip_longest(found, needed, fillvalue="")):
+        if one != other:
+            values = [shown(name) if name else "missing" for name in (one, other)]
+            return f"joint_names[{i}] is {values[0]}, here {values[1]}"
+    return ""
 
 
 def objects_named(objects: Sequence[ObjectSpec], names: Iterable[str]) -> dict[str, ObjectSpec]:

@@ -43,6 +43,9 @@ or images, and the LSTM's state, two tensors [1, N, units]."""
 OUTPUTS = ("actions", "h_out", "c_out")
 """Outputs of the ONNX graph: mean actions [N, J], not limited yet, and the LSTM's next state."""
 
+_LISTED = 3
+"""Entries that a message names of all in which a contract differs."""
+
 
 class Policy(Protocol):
     """Interface of a policy."""
@@ -143,6 +146,8 @@ def _compare(source: str, contract: Contract, here: Contract, robot: RobotSpec) 
             for name in trained | needed
             if trained.get(name) != needed.get(name)
         ]
+        if len(differing) > _LISTED:
+            differing = [*differing[:_LISTED], f"and {len(differing) - _LISTED} more"]
         if differing:
             fix = fixes.get(part, "Use the run's own configuration.")
             raise PolicyError(
@@ -186,7 +191,7 @@ def _meaning(contract: Contract) -> dict[str, dict[str, Any]]:
     for group, terms in contract.observation_layout.items():
         widths |= {f"{group}.{term}": width for term, width in terms.items()}
     return {
-        "joint order": {"joint_names": contract.joint_names},
+        "joint order": {f"joint_names[{i}]": name for i, name in enumerate(contract.joint_names)},
         "fingertips": {"fingertip_names": contract.fingertip_names},
         "version of the robot": {"robot_fingerprint": contract.robot_fingerprint},
         "time between actions": {"control_dt": contract.control_dt},

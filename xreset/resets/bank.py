@@ -37,7 +37,7 @@ from xreset.files.records import (
 from xreset.files.text import Brief, shown
 from xreset.retarget.accounts import Account, accounts
 from xreset.retarget.file import JointNames, ReasonNames
-from xreset.spec import ObjectSpec, RobotSpec, check_robot
+from xreset.spec import ObjectSpec, RobotSpec, check_robot, first_difference
 
 SCHEMA = "xreset-resets/1"
 
@@ -243,10 +243,10 @@ def check_states(bank: ResetBank, robot: RobotSpec, objects: tuple[ObjectSpec, .
         raise XResetError(f"bank is {shown(bank)}, expected a ResetBank: xreset.read_bank(FILE).")
     if not bank.num_states:
         return
-    if bank.joint_names != robot.joint_names:
+    if differs := first_difference(bank.joint_names, robot.joint_names):
         raise FileFormatError(
-            f"The reset bank is for the robot {bank.robot!r}, whose joints are not those of {robot.name!r}. Use one "
-            "robot."
+            f"The reset bank is for the robot {bank.robot!r}, whose joints are not those of {robot.name!r}: {differs}. "
+            "Use one robot."
         )
     check_objects("The reset bank", bank, objects)
 

@@ -50,7 +50,7 @@ def film(
         env.advance(player.act(env.get_observations()))
         if step % every == 0:
             frames.append(_frame(env, world, size))
-    write_whole(Path(path), encode_mp4(np.stack(frames), 1.0 / (every * control_dt)))
+    write_whole(Path(path), encode_mp4(frames, 1.0 / (every * control_dt)))
 
 
 def _frame(env: ManipulationEnv, world: int, size: tuple[int, int]) -> np.ndarray:

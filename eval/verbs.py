@@ -8,6 +8,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -221,7 +222,7 @@ def make_report(
         robot: name or folder of the robot, for the films; default: as the run and the results name it.
         meshes: folder of real meshes, for the films; default: as the results name it.
         film: MP4 to write as well: every object in every run and engine, next to each other.
-        progress: called with the name of what is drawn.
+        progress: called with the name of what is drawn, and for the film with (objects drawn, objects in all).
 
     Returns:
         What the page shows.
@@ -245,8 +246,9 @@ def make_report(
         progress("drawing films", 0, 0)
         found = make.write_report(found, Path(out), **films)
     if film is not None:
-        progress("drawing the film", 0, 0)
-        found = replace(found, filmed=clips.make_film(found.evaluated, Path(film), **films))
+        moved = partial(progress, "drawing the film")
+        filmed = clips.make_film(found.evaluated, Path(film), **films, progress=moved)
+        found = replace(found, filmed=filmed)
     return found
 
 

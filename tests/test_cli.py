@@ -23,7 +23,7 @@ from tests.command import xreset as run
 from tests.data import InFolder
 from xreset.backends import pybullet
 from xreset.cameras.config import WRIST
-from xreset.cli import COMMANDS, _terminal
+from xreset.cli import COMMANDS, _terminal, _verbs
 from xreset.cli._options import RULES, checked
 from xreset.cli._verbs import verb
 from xreset.errors import XResetError
@@ -340,6 +340,19 @@ class UsageTest(TestCase):
             for done in range(1, 5):
                 count(done, 8)
         self.assertEqual(err.getvalue(), "sequences: 25 %\nsequences: 50 %\n")
+
+    def test_a_command_that_may_show_a_page_has_a_bar_only_when_it_draws(self):
+        bar = _terminal.Progress(_terminal.Console(file=io.StringIO()))
+        shown = []
+
+        def show(*, say: Callable[[str], None], progress: Callable[[str, float, int], None]):
+            shown.append(bar.live.is_started)
+            progress("drawing", 1, 2)
+            shown.append(bar.live.is_started)
+
+        with patch.object(_verbs, "Progress", lambda: bar):
+            _verbs.verb(show)()
+        self.assertEqual([*shown, bar.live.is_started], [False, True, False])
 
     def test_training_without_its_packages_says_what_to_install(self):
         code = (

@@ -354,6 +354,7 @@ class ClipTest(Reported):
         robot = toy_hand_arm(self.folder)
         rollouts = toy_rollouts(robot.home)
         self.write(rollouts=rollouts, joints=robot.joint_names, vision=SEEING)
+        drawn = []
         with (
             mock.patch("xreset.eval.report.read.load_robot", lambda _: robot),
             mock.patch("xreset.eval.report.clips.load_robot", lambda _: robot),
@@ -361,10 +362,12 @@ class ClipTest(Reported):
         ):
             encode.return_value = b"film"
             (training,) = read_trainings([self.folder])
-            objects = make_film([training], self.folder / "film.mp4")
+            file = self.folder / "film.mp4"
+            objects = make_film([training], file, progress=lambda *done: drawn.append(done))
         frames, fps = encode.call_args.args
         names = tuple(sorted({trace.object for trace in rollouts.traces}))
         self.assertEqual((set(training.results), objects), (set(ENGINES), names))
+        self.assertEqual(drawn, [(i, len(names)) for i in range(len(names))])
         self.assertEqual((len(frames), *frames.shape[2:]), (3, len(names) * 200, 3))
         self.assertEqual(round(fps), 10)
         self.assertEqual(frames.shape[1] % 4, 0)

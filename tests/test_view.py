@@ -8,6 +8,7 @@ import urllib.request
 from contextlib import redirect_stdout
 from dataclasses import replace
 from http.client import HTTPConnection
+from itertools import count
 from unittest import mock
 from xml.etree import ElementTree
 
@@ -27,6 +28,7 @@ from tests.data import InOneFolder, refuses
 from tests.toy_bank import SOUP, SPAM
 from tests.toy_goals import toy_goals
 from xreset import Demos, robots, write_bank, write_demos, write_goals, write_retargeted
+from xreset.cli import _terminal
 from xreset.errors import FileFormatError, XResetError
 from xreset.geometry.kinematics import Kinematics
 from xreset.pictures.meshes import rgb, tint
@@ -235,7 +237,9 @@ class Pictures(WithFiles):
         )
         self.assertEqual(out.read_bytes(), expected.read_bytes())
         film = self.folder / "view.mp4"
-        self.assertIn("2 frames", succeeds("view", self.bank, "--mp4", film, "--sequence 0"))
+        with mock.patch.object(_terminal, "monotonic", count(0, 61).__next__):
+            printed = succeeds("view", self.bank, "--mp4", film, "--sequence 0")
+        self.assertEqual(printed, f"2 frames in {film}\ndrawing: 0 %\ndrawing: 50 %\n")
         self.assertEqual(film.read_bytes()[4:8], b"ftyp")
         self.assertIn(
             "Frame 4 does not exist", refused("view", self.retargeted, "--png", out, "--frame 4")

@@ -80,7 +80,7 @@ def draw_film(scene: SceneSpec, moments: Sequence[Moment]) -> bytes:
         pose = (moment.object_pos, moment.object_quat)
         goal = (moment.goal_pos, moment.goal_quat)
         frames.append(renderer.draw(moment.joint_pos, pose, goal_pose=goal))
-    return encode_mp4(np.stack(frames), 1.0 / (every * scene.control_dt))
+    return encode_mp4(frames, 1.0 / (every * scene.control_dt))
 
 
 def last_moments(session: Session, seconds: float | None) -> list[Moment]:

@@ -16,6 +16,7 @@ from xreset.eval.report.read import Training
 from xreset.eval.results import Trace
 from xreset.eval.stats import Table
 from xreset.files.checks import frozen
+from xreset.files.progress import Progress, unseen
 from xreset.files.storage import write_whole
 from xreset.files.text import short_name
 from xreset.geometry.description import load_robot
@@ -274,9 +275,10 @@ def make_film(
     *,
     robot: str | None = None,
     meshes: Path | None = None,
+    progress: Progress = unseen,
 ) -> tuple[str, ...]:
     """Write an mp4 with the best episode of each object in every run and engine (:func:`best_everywhere`), at its own
-    speed.
+    speed. ``progress`` is called with the objects drawn and the objects in all.
 
     Returns:
         The objects, from the left; from above are the runs, each in its engines.
@@ -286,7 +288,9 @@ def make_film(
         XResetError: the film cannot be encoded or written.
     """
     columns = {}
-    for name, own in recorded_in(trainings, robot).groupby("object"):
+    episodes_of = recorded_in(trainings, robot).groupby("object")
+    for i, (name, own) in enumerate(episodes_of):
+        progress(i, len(episodes_of))
         if clips := _draw_runs(best_everywhere(own), trainings, robot, meshes):
             columns[str(name)] = clips
     if not columns:

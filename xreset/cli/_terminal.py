@@ -56,13 +56,18 @@ class Progress(rich.progress.Progress):
         self._shown = monotonic()
 
     def update(self, task_id: rich.progress.TaskID, **changes: Any) -> None:
-        """See :meth:`rich.progress.Progress.update`."""
+        """See :meth:`rich.progress.Progress.update`. After ``stop`` the bars are back."""
+        self.start()
         super().update(task_id, **changes)
         now = monotonic()
         if not self.console.is_terminal and now > self._shown + 60:
             self._shown = now
             task = self._tasks[task_id]
             print(f"{task.description}: {task.percentage:.0f} %", file=sys.stderr)
+
+    def stop(self) -> None:
+        """Remove the bars, without the empty line of :meth:`rich.progress.Progress.stop` in a file."""
+        self.live.stop()
 
     def count(self, what: str) -> Callable[[float, float], None]:
         """Add a bar, and return the function that moves it: (done, in all)."""

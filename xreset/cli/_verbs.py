@@ -77,6 +77,8 @@ def verb(
             with Progress() as bar:
                 staged = len(get_args(progress)[0]) == 3  # with the name of the stage
                 moved = bar.stages() if staged else bar.count(function.__name__.replace("_", " "))
+                if "say" in hints:
+                    bar.stop()  # it may show a page; a film brings the bar back
                 found = function(**arguments, progress=moved)
         if show is not None:
             show(found, given | {"seconds": monotonic() - begun})

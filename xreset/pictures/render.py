@@ -9,7 +9,8 @@ from __future__ import annotations
 import io
 import math
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -241,11 +242,11 @@ def write_png(path: str | Path, picture: np.ndarray) -> None:
     write_whole(path, encode_png(picture))
 
 
-def encode_mp4(frames: np.ndarray, fps: float, *, keyframes: int | None = None) -> bytes:
+def encode_mp4(frames: Iterable[np.ndarray], fps: float, *, keyframes: int | None = None) -> bytes:
     """Encode a film as H.264 in an mp4 file that every browser plays.
 
     Args:
-        frames: [T, H, W, 3] uint8 with even H and W.
+        frames: pictures [H, W, 3] uint8 with even H and W, at least one.
         fps: frames per second.
         keyframes: number of frames from one keyframe to the next; None: the encoder's choice.
 
@@ -257,11 +258,13 @@ def encode_mp4(frames: np.ndarray, fps: float, *, keyframes: int | None = None) 
     settings = "-crf 24 -preset veryfast -movflags +faststart -threads 1 -bitexact"
     if keyframes is not None:
         settings += f" -g {keyframes}"
+    rest = iter(frames)
+    first = next(rest)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "clip.mp4"
         writer = imageio_ffmpeg.write_frames(  # it accepts more types than its annotations say
             str(path),
-            frames.shape[2:0:-1],
+            first.shape[1::-1],
             fps=fps,  # pyright: ignore[reportArgumentType]
             codec="libx264",
             macro_block_size=2,
@@ -270,7 +273,7 @@ def encode_mp4(frames: np.ndarray, fps: float, *, keyframes: int | None = None) 
         )
         try:
             writer.send(None)
-            for frame in frames:
+            for frame in chain([first], rest):
                 writer.send(np.ascontiguousarray(frame))
             writer.close()
             return path.read_bytes()

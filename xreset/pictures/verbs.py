@@ -6,7 +6,7 @@ They import most of what they need when they are called, because the help of a c
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -43,6 +43,7 @@ def view(
     mp4: Mp4 | None = None,
     say: Callable[[str], None] = print,
     note: Callable[[str], None] = _warn,
+    progress: Callable[[str, float, int], None] = unseen,
 ) -> None:
     """Show demonstrations, robot motion, a reset bank or a goal set in a browser, or write pictures of them.
 
@@ -63,6 +64,7 @@ def view(
         mp4: film of the sequence to write, instead of a page.
         say: called with the address of the page, or with what the picture shows.
         note: called with each doubt about the demonstrations.
+        progress: called with ("drawing", frames of the film drawn, frames in all).
 
     Raises:
         XResetError: a file, the robot or an object cannot be used, the files do not belong together, or the server does
@@ -80,7 +82,7 @@ def view(
     if png is not None:
         _write_png(Path(png), shown, rows, frame, say)
     if mp4 is not None:
-        _write_mp4(Path(mp4), shown, rows, say)
+        _write_mp4(Path(mp4), shown, rows, say, progress)
 
 
 def _serve(
@@ -117,17 +119,26 @@ def _write_png(
     say("\n".join((*shown.text(row), f"picture in {path}")))
 
 
-def _write_mp4(path: Path, shown: View, rows: np.ndarray, say: Callable[[str], None]) -> None:
-    from rich.progress import track
-
+def _write_mp4(
+    path: Path,
+    shown: View,
+    rows: np.ndarray,
+    say: Callable[[str], None],
+    progress: Callable[[str, float, int], None],
+) -> None:
     from xreset.pictures.render import encode_mp4
     from xreset.pictures.view.picture import Drawer
 
     if not len(rows):
         raise XResetError("This sequence has no state to film. Choose another one with --sequence.")
     draw = Drawer(shown).draw
-    frames = [draw(int(row)) for row in track(rows, "drawing", transient=True)]
-    write_whole(path, encode_mp4(np.stack(frames), shown.rate))
+
+    def frames() -> Iterator[np.ndarray]:
+        for i, row in enumerate(rows):
+            progress("drawing", i, len(rows))
+            yield draw(int(row))
+
+    write_whole(path, encode_mp4(frames(), shown.rate))
     say(f"{quantity(len(rows), 'frame')} in {path}")
 
 

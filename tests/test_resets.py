@@ -153,7 +153,7 @@ class FilterTest(TestCase):
 
         motion = self.retargeted(first_contact=np.array([2, 1]))
         with (
-            mock.patch("xreset.resets.filter.probe", probe),
+            mock.patch("xreset.resets.probe.probe", probe),
             mock.patch("xreset.resets.filter.fingers_of"),
             mock.patch("xreset.resets.filter.grip_forces"),
             mock.patch("xreset.resets.filter.squeeze_targets", pressed),

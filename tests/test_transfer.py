@@ -31,7 +31,7 @@ from xreset.physics import Health, State
 from xreset.pictures.view.load import load_view
 from xreset.resets.bank import starts_and_goals
 from xreset.resets.distribution import ResetDistribution
-from xreset.resets.transfer import _is_held, add_transfers
+from xreset.resets.transfer import _lost, add_transfers
 from xreset.retarget.file import read_retargeted
 from xreset.robot_tools.verbs import judge
 from xreset.task.config import ResetConfig
@@ -132,10 +132,10 @@ def tried(base, data, *, verdicts=None, **config):
     def probe(engine, scene, object_name, states, judge, **options):
         calls.append((engine, scene, object_name, states, options))
         if verdicts is None:
-            return np.ones(len(object_name), dtype=bool)
-        return np.array(verdicts[len(calls) - 1])
+            return np.full(len(object_name), -1)
+        return np.where(verdicts[len(calls) - 1], -1, 0)
 
-    with patch("xreset.resets.transfer.probe", probe):
+    with patch("xreset.resets.probe.probe", probe):
         return added(base, data, **config), calls
 
 
@@ -298,9 +298,7 @@ class HeldTest(TestCase):
         backend = Mock()
         backend.state.return_value = state
         backend.health.return_value = Health(nonfinite=world == 4, overflow=world == 5)
-        self.assertEqual(
-            _is_held(backend, start).tolist(), [True, False, True, False, False, False, False]
-        )
+        self.assertEqual(_lost(backend, start).tolist(), [-1, 0, -1, 0, 0, 0, 0])
 
 
 class BankTest(InFolder):

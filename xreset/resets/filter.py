@@ -15,14 +15,14 @@ import numpy as np
 import torch
 
 from xreset.errors import DemoError
-from xreset.files.progress import Progress, unseen
+from xreset.files.progress import Progress
 from xreset.geometry.collision import object_depth
 from xreset.physics import State
 from xreset.resets.bank import ResetBank, starts_and_goals
 from xreset.resets.closing import closing_states
 from xreset.resets.config import ClosingConfig, FilterConfig, SqueezeConfig
 from xreset.resets.fingers import fingers_of, grip_forces, squeeze_targets
-from xreset.resets.probe import REASONS, probe, rejection
+from xreset.resets.probe import REASONS, rejection, rejections
 from xreset.retarget.file import Retargeted
 from xreset.retarget.validity import Thresholds
 from xreset.spec import (
@@ -63,7 +63,16 @@ def stable_states(
     post_contact = retargeted.post_contact[frame]
     object_name = retargeted.object_name[sequence]
     states = State.at_rest(*map(torch.as_tensor, poses))
-    find = partial(_reasons, engines, scene, limits=limits, num_envs=num_envs, device=device)
+    find = partial(
+        rejections,
+        engines,
+        scene,
+        judge=partial(rejection, limits=limits),
+        gravity=0.0,
+        steps=limits.steps,
+        num_envs=num_envs,
+        device=device,
+    )
     depth = object_depth(robot, objects, object_name, *poses)
     shallow = np.flatnonzero(depth <= Thresholds().object_depth)
     reason = np.full(len(frame), REASONS.index("object collision"))
@@ -108,48 +117,3 @@ def stable_states(
         **kept,
         **rejected,
     )
-
-
-def _reasons(
-    engines: Sequence[str],
-    scene: SceneSpec,
-    object_name: np.ndarray,
-    states: State,
-    *,
-    limits: FilterConfig,
-    num_envs: int,
-    device: str,
-    progress: Progress = unseen,
-) -> np.ndarray:
-    """Return the reasons [M] for which states are rejected, -1 where every engine accepts them.
-
-    Args:
-        engines: names of the engines; each tries the states that those before it accept.
-        scene: robot and objects.
-        object_name: [M] object of each state.
-        states: [M, ...] the states.
-        limits: time and speeds by which states are judged.
-        num_envs: worlds at a time.
-        device: where engines run that can use it.
-        progress: called with (states tried, states to try in all engines).
-    """
-    count = len(object_name)
-    reason = np.full(count, -1, dtype=np.int64)
-    for number, name in enumerate(engines):
-        left = np.flatnonzero(reason < 0)
-        if not len(left):
-            break
-        before = number * count
-        reason[left] = probe(
-            name,
-            scene,
-            object_name[left],
-            states[torch.as_tensor(left)],
-            partial(rejection, limits=limits),
-            gravity=0.0,
-            steps=limits.steps,
-            num_envs=num_envs,
-            device=device,
-            progress=lambda done, before=before: progress(before + done, len(engines) * count),
-        )
-    return reason

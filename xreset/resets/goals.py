@@ -292,7 +292,9 @@ def _resting_poses(
     Raises:
         GoalError: an object does not come to rest.
     """
-    episodes = []
+    names = []
+    starts = []
+    quats = []
     rows: dict[str, np.ndarray] = {}
     for obj in objects:
         random = np.random.default_rng(zlib.crc32(obj.name.encode()))
@@ -303,15 +305,14 @@ def _resting_poses(
         # for each direction, the first one that leads to the same pose
         first_alike = (ups @ ups.T > _SAME_POSE).argmax(axis=1)
         poses, which = np.unique(first_alike, return_inverse=True)
-        rows[obj.name] = len(episodes) + which
-        for pose in poses:
-            turn = turns[int(pose)]
-            center = np.array([*_MIDDLE, rest_height(obj, quat_of(turn))]) + turn.apply(obj.com)
-            place = {"start": center, "start_turn": turn, "goal": center, "goal_turn": turn}
-            episodes.append(_Episode(obj=obj, family="rest", number=len(episodes), **place))
-    from xreset.resets.settle import settle_starts
+        rows[obj.name] = len(names) + which
+        for quat in quat_of(turns[poses]):
+            names.append(obj.name)
+            starts.append((*_MIDDLE, rest_height(obj, quat)))
+            quats.append(quat)
+    from xreset.resets.settle import settled
 
-    settled, at_rest = settle_starts(_goal_set(robot, episodes), robot, objects)
+    pos, quat, at_rest = settled(robot, objects, names, np.array(starts), np.array(quats))
     rests = {}
     for obj in objects:
         tried = rows[obj.name]
@@ -321,8 +322,8 @@ def _resting_poses(
                 f"{obj.name} does not come to rest on the table: it rolls or falls over in MuJoCo. Leave it"
                 " out, or make a side of its mesh flat."
             )
-        turns = turn_of(settled.start_quat_wxyz[resting])
-        heights = settled.start_pos[resting, 2] + turns.apply(obj.com)[:, 2]
+        turns = turn_of(quat[resting])
+        heights = pos[resting, 2] + turns.apply(obj.com)[:, 2]
         rests[obj.name] = list(zip(heights, turns, strict=True))
     return rests
 

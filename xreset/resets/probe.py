@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from xreset.files.progress import Progress, unseen
 from xreset.physics import Backend, State
 from xreset.physics.plugins import device_for, make_backend
 from xreset.resets.config import FilterConfig
@@ -79,6 +81,46 @@ def probe(
             progress(done)
     order = np.argsort(np.concatenate(rows))
     return np.concatenate(verdicts)[order]
+
+
+def rejections(
+    engines: Sequence[str],
+    scene: SceneSpec,
+    object_name: np.ndarray,
+    states: State,
+    judge: Judge,
+    *,
+    progress: Progress = unseen,
+    **options: Any,
+) -> np.ndarray:
+    """Return the reasons [M] for which states are rejected, -1 where every engine accepts them.
+
+    Args:
+        engines: names of the engines; each tries the states that those before it accept.
+        scene: robot and objects.
+        object_name: [M] object of each state.
+        states: [M, ...]
+        judge: returns the reasons of an engine's worlds, -1 where accepted.
+        progress: called with (states tried, states to try in all engines).
+        options: others of :func:`probe`.
+    """
+    count = len(object_name)
+    reason = np.full(count, -1, dtype=np.int64)
+    for number, name in enumerate(engines):
+        left = np.flatnonzero(reason < 0)
+        if not len(left):
+            break
+        before = number * count
+        reason[left] = probe(
+            name,
+            scene,
+            object_name[left],
+            states[torch.as_tensor(left)],
+            judge,
+            progress=lambda done, before=before: progress(before + done, len(engines) * count),
+            **options,
+        )
+    return reason
 
 
 def rejection(backend: Backend, start: State, limits: FilterConfig) -> Tensor:

@@ -18,7 +18,6 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from xreset.files.checks import frozen
 from xreset.files.processes import batches
 from xreset.files.progress import Progress
 from xreset.geometry.collision import object_depth
@@ -28,7 +27,7 @@ from xreset.physics import Backend, State
 from xreset.resets.bank import ResetBank
 from xreset.resets.config import TransferConfig
 from xreset.resets.grasps import carried
-from xreset.resets.probe import probe
+from xreset.resets.probe import rejections
 from xreset.retarget.arm.config import QUICK
 from xreset.retarget.arm.model import ArmModel, ArmTargets
 from xreset.retarget.arm.solve import track_each
@@ -60,20 +59,6 @@ _BATCH = 512
 """Candidates whose inverse kinematics is solved at a time, at most; limits the memory that this takes."""
 _SMALL_BATCH = 64
 """Candidates up to which one batch takes less time than a second process takes to start."""
-
-
-@frozen
-class _Poses:
-    """Object poses of demonstrations, in the world frame."""
-
-    sequence: np.ndarray
-    """[W] index of the demonstration."""
-    frame: np.ndarray
-    """[W] frame within the demonstration."""
-    pos: np.ndarray
-    """[W, 3] m"""
-    quat: np.ndarray
-    """[W, 4]"""
 
 
 def add_transfers(
@@ -108,8 +93,8 @@ def add_transfers(
     grasps = np.flatnonzero(carried(bank, robot, start_pos[:, 2]))
     if not len(grasps):
         return bank
-    poses = _raised_poses(retargeted)
-    pose, grasp = _candidates(bank, grasps, poses)
+    poses = _raised_frames(retargeted)
+    pose, grasp = _candidates(bank, grasps, retargeted.sequence_of_frame[poses])
     used = objects_named(objects, bank.object_name[grasp])
     scene = SceneSpec(robot=robot, objects=tuple(used.values()))
     place = np.arange(len(pose)) - np.searchsorted(pose, pose)
@@ -119,7 +104,7 @@ def add_transfers(
     at_once = 2 * config.per_pose
     work = len(pose) * (1 + len(bank.engines))
     for first in range(0, _CANDIDATES, at_once):
-        found = np.bincount(pose[np.concatenate(rows)], minlength=len(poses.sequence))
+        found = np.bincount(pose[np.concatenate(rows)], minlength=len(poses))
         is_next = (place >= first) & (place < first + at_once)
         tried = np.flatnonzero(is_next & (found[pose] < config.per_pose))
         if not len(tried):
@@ -129,8 +114,8 @@ def add_transfers(
         holding, held, depth = _holding(
             bank,
             grasp[tried],
-            poses,
-            pose[tried],
+            retargeted,
+            poses[pose[tried]],
             scene,
             num_envs=num_envs,
             device=device,
@@ -147,14 +132,14 @@ def add_transfers(
     kept = _first_of_each(held, pose, config.per_pose)
     chosen = order[np.searchsorted(held, kept)]
     added = State.cat(states)[torch.as_tensor(chosen)]
-    return _joined(bank, added, poses, pose[kept], np.concatenate(depths)[chosen])
+    return _joined(bank, added, retargeted, poses[pose[kept]], np.concatenate(depths)[chosen])
 
 
 def _holding(
     bank: ResetBank,
     grasp: np.ndarray,
-    poses: _Poses,
-    pose: np.ndarray,
+    retargeted: Retargeted,
+    frame: np.ndarray,
     scene: SceneSpec,
     *,
     num_envs: int,
@@ -168,67 +153,58 @@ def _holding(
         every engine; their candidates, ascending; and how deep the robot is in the object [m].
     """
     count = len(grasp)
-    steps = 1 + len(bank.engines)
+    engines = len(bank.engines)
+    names = bank.object_name[grasp]
     states, is_reached = _carried(
-        bank, grasp, poses, pose, scene.robot, lambda done: progress(done / count / steps)
+        bank,
+        grasp,
+        retargeted,
+        frame,
+        scene.robot,
+        lambda done: progress(done / count / (1 + engines)),
     )
     held = np.flatnonzero(is_reached)
     depth = np.full(count, np.inf)
-    depth[held] = _depth(scene, bank.object_name[grasp[held]], states[held])
+    depth[held] = _depth(scene, names[held], states[held])
     held = np.flatnonzero(depth <= _THRESHOLDS.object_depth)
-    for number, engine in enumerate(bank.engines, start=1):
-        if not len(held):
-            break
-        holds = probe(
-            engine,
-            scene,
-            bank.object_name[grasp[held]],
-            states[torch.as_tensor(held)],
-            _is_held,
-            gravity=1.0,
-            steps=_STEPS,
-            num_envs=num_envs,
-            device=device,
-            progress=lambda done, number=number, of=held.size: progress(
-                (number + done / of) / steps
-            ),
-        )
-        held = held[holds]
+    lost = rejections(
+        bank.engines,
+        scene,
+        names[held],
+        states[torch.as_tensor(held)],
+        _lost,
+        gravity=1.0,
+        steps=_STEPS,
+        num_envs=num_envs,
+        device=device,
+        progress=lambda done, work: progress((1 + engines * done / work) / (1 + engines)),
+    )
+    held = held[lost < 0]
     return states[torch.as_tensor(held)], held, depth[held]
 
 
-def _raised_poses(retargeted: Retargeted) -> _Poses:
-    """Return some poses of every demonstration, evenly spread over the frames in which the object is raised. The last
-    one is the goal if the object is raised there."""
-    sequence = []
-    frame = []
+def _raised_frames(retargeted: Retargeted) -> np.ndarray:
+    """[W] some frames of every demonstration, evenly spread over those in which the object is raised. The last one is
+    the goal if the object is raised there."""
+    chosen = []
     start_pos, _ = retargeted.start_pose
     for number, start in enumerate(start_pos):
-        height = retargeted.object_pos[retargeted.frames(number), 2] - start[2]
-        raised = np.flatnonzero(height > _RAISED)
+        frames = retargeted.frames(number)
+        raised = np.flatnonzero(retargeted.object_pos[frames, 2] - start[2] > _RAISED)
         spread = np.linspace(0, len(raised) - 1, min(_POSES, len(raised)))
-        chosen = raised[spread.astype(int)]
-        sequence += [number] * len(chosen)
-        frame += chosen.tolist()
-    own = np.array(sequence, dtype=int)
-    within = np.array(frame, dtype=int)
-    rows = retargeted.frame_offsets[own] + within
-    return _Poses(
-        sequence=own,
-        frame=within,
-        pos=retargeted.object_pos[rows],
-        quat=retargeted.object_quat_wxyz[rows],
-    )
+        chosen += (frames.start + raised[spread.astype(int)]).tolist()
+    return np.array(chosen, dtype=int)
 
 
 def _candidates(
-    bank: ResetBank, grasps: np.ndarray, poses: _Poses
+    bank: ResetBank, grasps: np.ndarray, owner: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Draw grasps of other demonstrations for each pose: pose [M], ascending, and state of the bank [M]."""
+    """Draw grasps of other demonstrations for each pose of a demonstration ``owner`` [W]: pose [M], ascending, and
+    state of the bank [M]."""
     random = np.random.default_rng(_SEED)
     pose = []
     grasp = []
-    for number, sequence in enumerate(poses.sequence):
+    for number, sequence in enumerate(owner):
         same_object = bank.object_name[grasps] == bank.sequence_object[sequence]
         others = grasps[same_object & (bank.sequence_index[grasps] != sequence)]
         drawn = random.permutation(others)[:_CANDIDATES]
@@ -240,8 +216,8 @@ def _candidates(
 def _carried(
     bank: ResetBank,
     grasp: np.ndarray,
-    poses: _Poses,
-    pose: np.ndarray,
+    retargeted: Retargeted,
+    frame: np.ndarray,
     robot: RobotSpec,
     progress: Callable[[int], None],
 ) -> tuple[State, np.ndarray]:
@@ -250,8 +226,8 @@ def _carried(
     Args:
         bank: the bank that has the grasps.
         grasp: [M] state of the bank.
-        poses: the poses.
-        pose: [M] index of the pose.
+        retargeted: the motion.
+        frame: [M] frame of the motion to whose pose the object is brought.
         robot: the robot.
         progress: called with the number of candidates done.
 
@@ -259,10 +235,12 @@ def _carried(
         States [M] at rest, and whether the arm reaches each of them [M].
     """
     model = ArmModel(robot)
+    pos = retargeted.object_pos[frame]
+    quat = retargeted.object_quat_wxyz[frame]
     joint_pos = bank.joint_pos[grasp].astype(float)
     root = model.kinematics.link_poses(torch.as_tensor(joint_pos), [robot.hand_root])[:, 0].numpy()
-    turn = turn_of(poses.quat[pose]) * turn_of(bank.object_quat_wxyz[grasp]).inv()
-    root_pos = poses.pos[pose] + turn.apply(root[:, :3, 3] - bank.object_pos[grasp])
+    turn = turn_of(quat) * turn_of(bank.object_quat_wxyz[grasp]).inv()
+    root_pos = pos + turn.apply(root[:, :3, 3] - bank.object_pos[grasp])
     root_turn = turn * Rotation.from_matrix(root[:, :3, :3])
     root_quat = matrix_to_quat(torch.as_tensor(root_turn.as_matrix()))
     hand_joints = torch.as_tensor(joint_pos[:, model.hand.joint_indices])
@@ -281,7 +259,7 @@ def _carried(
         progress(int(rows[-1]) + 1)
     joint_target = joint_pos.copy()
     joint_target[:, robot.hand_indices] = bank.targets[grasp][:, robot.hand_indices]
-    arrays = (joint_pos, poses.pos[pose], poses.quat[pose], joint_target)
+    arrays = (joint_pos, pos, quat, joint_target)
     return State.at_rest(*map(torch.as_tensor, arrays)), is_reached
 
 
@@ -292,13 +270,14 @@ def _depth(scene: SceneSpec, object_name: np.ndarray, states: State) -> np.ndarr
     return object_depth(scene.robot, scene.objects, object_name, *arrays)
 
 
-def _is_held(backend: Backend, start: State) -> Tensor:
-    """[N] bool: whether the object of each world is where it was at the start."""
+def _lost(backend: Backend, start: State) -> Tensor:
+    """[N] -1 where the object of a world is where it was at the start, else 0."""
     state = backend.state()
     health = backend.health()
     moved = (state.object_pos - start.object_pos).norm(dim=-1)
     turned = quat_angle(state.object_quat, start.object_quat)
-    return (moved < _MOVED) & (turned < _TURNED) & ~health.nonfinite & ~health.overflow
+    held = (moved < _MOVED) & (turned < _TURNED) & ~health.nonfinite & ~health.overflow
+    return torch.where(held, -1, 0)
 
 
 def _first_of_each(rows: np.ndarray, group: np.ndarray, count: int) -> np.ndarray:
@@ -309,11 +288,13 @@ def _first_of_each(rows: np.ndarray, group: np.ndarray, count: int) -> np.ndarra
 
 
 def _joined(
-    bank: ResetBank, states: State, poses: _Poses, pose: np.ndarray, depth: np.ndarray
+    bank: ResetBank, states: State, retargeted: Retargeted, frame: np.ndarray, depth: np.ndarray
 ) -> ResetBank:
-    """Return the bank with states [M] at poses [M] after its own; ``depth`` [M] is that of the robot in the object."""
-    count = len(pose)
-    sequence = poses.sequence[pose]
+    """Return the bank with states [M] at poses of frames [M] after its own; ``depth`` [M] is that of the robot in the
+    object."""
+    count = len(frame)
+    sequence = retargeted.sequence_of_frame[frame]
+    within = frame - retargeted.frame_offsets[sequence]
     added = {
         "joint_pos": states.joint_pos.numpy(),
         "joint_target": states.joint_target.numpy(),
@@ -321,7 +302,7 @@ def _joined(
         "object_quat_wxyz": states.object_quat.numpy(),
         "object_name": bank.sequence_object[sequence],
         "sequence_index": sequence.astype(bank.sequence_index.dtype),
-        "frame_index": poses.frame[pose].astype(bank.frame_index.dtype),
+        "frame_index": within.astype(bank.frame_index.dtype),
         "post_contact": np.ones(count, dtype=bool),
         "object_depth": depth.astype(np.float32),
         "transferred": np.ones(count, dtype=bool),

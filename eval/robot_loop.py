@@ -54,7 +54,9 @@ def roll_out_on_robot(
             for sequence, repetition in zip(played.sequence, played.repetition, strict=True)
         ]
         driver = FaultyDriver(env, faults, seeds, lambda: played.update_metrics(env.reading()))
-        outcome = SimulatedRunner(controller, driver).run(env.max_episode_length * controller.dt)
+        length = env.max_episode_length * controller.dt
+        outcome = SimulatedRunner(controller, driver).run(length)
+        driver.wait_until(length)  # a runner ends early if it has stopped all of its robots
         for world in played.fresh:
             reason = outcome.reasons[world]
             if reason is not None:

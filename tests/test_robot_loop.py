@@ -13,12 +13,13 @@ from tests.command import succeeds, xreset
 from tests.data import InFolder
 from tests.toy_bank import SOUP
 from tests.toy_results import swept
-from xreset import stress
+from xreset import stress, synthesize
 from xreset.errors import PolicyError
 from xreset.eval.conditions import FAULTS
 from xreset.eval.effects import verdict
+from xreset.eval.policy_spec import load_policy
 from xreset.eval.results import read_evaluation
-from xreset.eval.rollout import engine, play_rounds
+from xreset.eval.rollout import Round, engine, play_rounds
 from xreset.live.engine import EngineDriver
 from xreset.live.faults import Faults, FaultyDriver
 from xreset.policy.shipped import shipped
@@ -150,6 +151,21 @@ class VerdictTest(TestCase):
         self.assertIn("only 30 % without any fault", reasons[0])
         self.assertIn("No verdict", verdict([self.result(only=6)])[0])
         self.assertEqual(verdict([swept([0.8] * 5, {("object-mass", 2.0): [0.8] * 5})]), ("", []))
+
+
+class StoppedTest(InFolder):
+    def test_an_episode_is_measured_to_its_end_although_its_robot_has_stopped(self):
+        """Its object may go on moving. With other robots that go on, its episode goes on anyway."""
+        demos = synthesize(SOUP, 1)
+        policy = load_policy("soup-can")
+        steps = round(policy.task.termination.episode_seconds / policy.task.control_dt)
+        measure = Round.update_metrics
+        with patch.object(Round, "update_metrics", autospec=True, side_effect=measure) as measured:
+            (found,) = stress(
+                policy, demos, properties="lost-frames=1.2", episodes=1, out=self.folder
+            )
+        self.assertEqual(list(found.stopped.values()), [1])
+        self.assertEqual(measured.call_count, 2 * steps)
 
 
 class CommandTest(InFolder):

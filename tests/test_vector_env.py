@@ -37,6 +37,24 @@ class VectorEnvTest(WithEnv):
                 assert_array_equal(reward, 0.0)
                 assert_array_equal(env.env.episode_length_buf, 0)
 
+    def test_a_seed_gives_the_same_episodes_whatever_has_succeeded_before(self):
+        """The demonstrations that fail most are drawn most often."""
+        reset = ResetConfig(adaptive_share=1.0)
+        inner = self.make(replace(TASK, reset=reset))
+        env = VectorEnv(inner)
+        self.addCleanup(env.close)
+        succeeded = torch.zeros(100, dtype=torch.long)
+        sequences = []
+        for _ in range(2):
+            drawn = []
+            for seed in range(8):
+                env.reset(seed=seed)
+                drawn.append(inner.sequence.tolist())
+                every = torch.ones_like(succeeded, dtype=torch.bool)
+                inner.resets.record(succeeded, every, every)
+            sequences.append(drawn)
+        self.assertEqual(*sequences)
+
     def test_an_episode_counts_once(self):
         """A broken world is counted in the step that ends it, and not again in the one that resets it."""
         task = replace(

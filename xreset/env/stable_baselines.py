@@ -15,6 +15,7 @@ from xreset.env.vector_env import (
     arrays,
     checked_action,
     observation_space,
+    set_seed,
     with_sound_rows,
 )
 from xreset.errors import needs
@@ -52,7 +53,7 @@ class StableBaselinesEnv(VecEnv):
     def reset(self) -> dict[str, np.ndarray]:
         """Begin an episode in every world and return the observations [N, ...] by group."""
         if self._seeds[0] is not None:
-            self.env.generator.manual_seed(self._seeds[0])
+            set_seed(self.env, self._seeds[0])
         self._reset_seeds()
         self.env.reset()
         return _of_an_actor(self.env.get_observations())

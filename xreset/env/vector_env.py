@@ -73,7 +73,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
             raise XResetError(f"Got {len(seed)} seeds. Give one seed: all worlds share it.")
         super().reset(seed=seed)
         if seed is not None:
-            self.env.generator.manual_seed(seed)
+            set_seed(self.env, seed)
         self._ended.zero_()
         self.env.reset()
         self._observations = self.env.get_observations()
@@ -111,6 +111,13 @@ class VectorEnv(gymnasium.vector.VectorEnv):
     def close_extras(self, **_: Any) -> None:
         """Close the engine."""
         self.env.close()
+
+
+def set_seed(env: ManipulationEnv, seed: int) -> None:
+    """Set the seed of all random numbers from now on, and forget how often each demonstration has succeeded: episodes
+    are drawn by that, too."""
+    env.generator.manual_seed(seed)
+    env.resets.success_rate.zero_()
 
 
 def observation_space(env: ManipulationEnv) -> gymnasium.spaces.Dict:

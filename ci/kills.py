@@ -169,7 +169,7 @@ def commands(folder: Path) -> list[Command]:
             folder / "robot" / "robot.toml",
             once=True,
         ),
-        Command("view", ["view", motion, "--png", folder / "a.png"], folder / "a.png"),
+        Command("view", ["view", motion, "--out", folder / "a.png"], folder / "a.png"),
         Command(
             "study",
             ["study", "seconds", "--out", studies],

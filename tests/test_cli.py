@@ -157,9 +157,17 @@ class UsageTest(TestCase):
             (r"Unknown device 'quantum'. Expected cpu, cuda or", "train --out x --device quantum"),
             (r"(File name too long|there is no)", "demos select " + "x" * 300),
             (r"there is nothing to report\. Give run folders", "report --robot openarm"),
-            (r"--png is x\.xyz, expected a name that ends in \.png", "view d.npz --png x.xyz"),
-            (r"--mp4 is x, expected a name that ends in \.mp4", "view d.npz --mp4 x"),
-            (r"--picture is x\.jpg, expected", "robots check openarm --picture x.jpg"),
+            (
+                r"--out is 'x\.xyz', expected a name that ends in \.png or \.mp4",
+                "view d.npz --out x.xyz",
+            ),
+            (r"--out is 'x', expected a name that ends in \.json or \.md", "engines check --out x"),
+            (r"--out is 'x\.md', expected", "engines compare x.npz --out x.md"),
+            (r"--picture is 'x\.jpg', expected", "robots check openarm --picture x.jpg"),
+            (
+                r"--out is given more than once. Give the command once for each file",
+                "view x.npz --out x.png --out x.mp4",
+            ),
             (
                 r"--out is d\.npz, which the command reads\. Nothing was overwritten",
                 "retarget d.npz --robot openarm --out ./d.npz",
@@ -190,6 +198,8 @@ class UsageTest(TestCase):
         for words, told in (
             ("engines check --backend bulet", ["--backend is now --engine"]),
             ("engines compare none --only mug", ["--only is now --object"]),
+            ("view none --mp4=x.mp4", ["--mp4 is now --out", "none"]),
+            ("engines check --engine bulet --page x.md", ["--page is now --out", "bulet"]),
             (
                 "train --resume --out none",
                 [

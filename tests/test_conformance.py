@@ -646,7 +646,7 @@ class Harness(InFolder):
     def test_command(self):
         file = self.folder / "c.json"
         words = "engines check --engine mujoco --check free_fall"
-        command = (words, "--json", file)
+        command = (words, "--out", file)
         said = succeeds(*command)
         self.assertIn("no check failed", said)
         data = json.loads(file.read_text())

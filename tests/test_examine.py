@@ -263,7 +263,7 @@ class Wrong(InFolder):
         for said in (
             succeeds(*take, *given, "--trust-recordings"),
             succeeds("demos select", out, *given),
-            succeeds("view", out, "--png", self.folder / "a.png"),
+            succeeds("view", out, "--out", self.folder / "a.png"),
             refused("retarget", out, "--robot ur7e-sharpa --out", self.folder / "r.npz"),
         ):
             self.assertEqual(said.count(words), 1, said)

@@ -353,7 +353,7 @@ class Comparing(InFolder):
             with mock.patch(
                 "xreset.eval.engines.agreement.compare", lambda *_, result=result, **__: result
             ):
-                options = ("--engine mujoco --json", self.folder / "parity.json")
+                options = ("--engine mujoco --out", self.folder / "parity.json")
                 found, text, _ = xreset("engines compare", path, *options)
             self.assertEqual(found, code)
             self.assertIn("press, fingertip", text)

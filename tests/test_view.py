@@ -229,7 +229,7 @@ class Pictures(WithFiles):
         out = self.folder / "view.png"
         self.assertIn(
             "not valid: joint limit",
-            succeeds("view", self.retargeted, "--png", out, "--sequence 1 --frame 1"),
+            succeeds("view", self.retargeted, "--out", out, "--sequence 1 --frame 1"),
         )
         expected = self.folder / "expected.png"
         write_png(
@@ -238,12 +238,13 @@ class Pictures(WithFiles):
         self.assertEqual(out.read_bytes(), expected.read_bytes())
         film = self.folder / "view.mp4"
         with mock.patch.object(_terminal, "monotonic", count(0, 61).__next__):
-            printed = succeeds("view", self.bank, "--mp4", film, "--sequence 0")
+            printed = succeeds("view", self.bank, "--out", film, "--sequence 0")
         self.assertEqual(printed, f"2 frames in {film}\ndrawing: 0 %\ndrawing: 50 %\n")
         self.assertEqual(film.read_bytes()[4:8], b"ftyp")
         self.assertIn(
-            "Frame 4 does not exist", refused("view", self.retargeted, "--png", out, "--frame 4")
+            "Frame 4 does not exist", refused("view", self.retargeted, "--out", out, "--frame 4")
         )
+        self.assertIn("Leave out the frame", refused("view", self.bank, "--out", film, "--frame 1"))
 
     def test_without_viser_the_message_says_what_to_install(self):
         with mock.patch.dict(sys.modules, {"viser": None}):

@@ -85,7 +85,7 @@ class WithoutTorchTest(InFolder):
         found = self.run_commands(
             *map("export deploy {0} --out on_robot/{0} --object soup".format, names),
             "demos synth --objects soup --per-object 1 --out demos.npz",
-            "view demos.npz --png demos.png",
+            "view demos.npz --out demos.png",
             "report run --out page",
         )
         for name in names:

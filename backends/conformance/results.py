@@ -1,6 +1,6 @@
 """What a check is and what it yields: measures, and a result with a verdict.
 
-The file that ``xreset engines check --json`` writes (schema :data:`SCHEMA`)::
+The file that ``xreset engines check --out FILE.json`` writes (schema :data:`SCHEMA`)::
 
     {"schema": ..., "xreset_version": ..., "command": ...,
      "runs": [{"engine", "engine_version", "robot", "device", "capabilities": [...], "seconds",

@@ -11,7 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from xreset.files.checks import Option, Output, PositiveInt, obeys_rules
+from xreset.files.checks import Json, JsonOrPage, Option, PositiveInt, obeys_rules
 from xreset.files.progress import unseen
 from xreset.files.storage import file_hash, measured, write_json, write_whole
 from xreset.physics.plugins import Device
@@ -30,8 +30,7 @@ def check_engines(
     robot: str | Path | None = None,
     device: Device = "cpu",
     only: Annotated[Sequence[str], Option("check")] = (),
-    json: Output | None = None,
-    page: Output | None = None,
+    out: JsonOrPage | None = None,
     say: Callable[[Any], None] = print,
 ) -> list[dict[str, Any]]:
     """Test whether physics engines keep their contract. The command exits with 1 if one does not.
@@ -42,8 +41,7 @@ def check_engines(
         device: where engines run that can use a GPU: cpu or cuda; the others run on the CPU.
         only: check to run, or several, with every measured number; default: all, with the number of each that is
             nearest to its tolerance.
-        json: file to write the results to.
-        page: Markdown page to write, with a table of the results.
+        out: file to write: every number (.json), or a page with tables (.md).
         say: called with lines about each check.
 
     Returns:
@@ -62,10 +60,10 @@ def check_engines(
     for name in [engines] if isinstance(engines, str) else dict.fromkeys(engines):
         runs.append(contract.check(name, spec, device, only, say))
     found = measured({"schema": conformance.SCHEMA, "runs": runs})
-    if json is not None:
-        write_json(json, found)
-    if page is not None:
-        write_whole(page, pages.page(found))
+    if out is not None and Path(out).suffix.lower() == ".json":
+        write_json(out, found)
+    elif out is not None:
+        write_whole(out, pages.page(found))
     return runs
 
 
@@ -79,7 +77,7 @@ def compare_engines(
     names: Annotated[Sequence[str], Option("object")] = (),
     grasps: PositiveInt = 48,
     device: Device = "cpu",
-    json: Output | None = None,
+    out: Json | None = None,
     progress: Callable[[str, float, int], None] = unseen,
 ) -> Parity:
     """Measure how far physics engines agree with MuJoCo on grasps. The command exits with 1 if one misses a target.
@@ -97,7 +95,7 @@ def compare_engines(
         names: object to use, or several; default: all objects of the file.
         grasps: number of closings, and of holds.
         device: where engines run that can use a GPU: cpu or cuda; the others run on the CPU.
-        json: file to write the results to.
+        out: file to write, with every number (.json).
         progress: called with (current try, tries done, tries in all).
 
     Raises:
@@ -116,6 +114,6 @@ def compare_engines(
     found = agreement.compare(
         inputs.robot, inputs.objects, grasped, tested, grasps=grasps, progress=progress
     )
-    if json is not None:
-        write_json(json, measured(asdict(found) | {"ok": not found.missed, "inputs": hashes}))
+    if out is not None:
+        write_json(out, measured(asdict(found) | {"ok": not found.missed, "inputs": hashes}))
     return found

@@ -19,6 +19,11 @@ _RENAMED = {
     "--like": "--recipe",
     "--fault": "--property",
     "engines compare --only": "--object",
+    "engines compare --json": "--out",
+    "engines check --json": "--out",
+    "engines check --page": "--out",
+    "view --png": "--out",
+    "view --mp4": "--out",
     # names of objects, as always
     "demos synth --objects": "--objects",
     "demos select --objects": "--objects",
@@ -69,7 +74,9 @@ def with_present_words(argv: list[str]) -> list[str]:
     renamed = {}
     for word in argv:
         flag, equals, value = word.partition("=")
-        present = _RENAMED.get(f"{command} {flag}", _RENAMED.get(flag, flag))
+        present = flag
+        for known in (flag, f"{argv[0]} {flag}", f"{command} {flag}"):
+            present = _RENAMED.get(known, present)
         if present != flag:
             renamed[flag] = present
         if flag.startswith("--vision."):

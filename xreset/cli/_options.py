@@ -27,7 +27,7 @@ from tyro.constructors import (
 
 from xreset.errors import XResetError
 from xreset.files.checks import Options, Written, check_value, marks_in, marks_of
-from xreset.files.storage import check_suffix, claim
+from xreset.files.storage import claim
 
 _LONGEST = 1000
 """Largest number of characters of a text or a file name, because messages repeat them."""
@@ -46,10 +46,13 @@ class _Option:
         return f"--{self.name.replace('_', '-')}"
 
     @property
-    def written(self) -> Written | None:
-        """The mark of a path that is written; None for other options, and if there is no path."""
-        found = [mark for mark in self.marks if isinstance(mark, Written)]
-        return found[0] if found and isinstance(self.value, Path) else None
+    def is_written(self) -> bool:
+        """Whether it is a path that the command writes."""
+        return _names_output(self.marks) and isinstance(self.value, Path)
+
+
+def _names_output(marks: Iterable[Any]) -> bool:
+    return any(isinstance(mark, Written) for mark in marks)
 
 
 def checked(command: Callable[..., None]) -> Callable[..., None]:
@@ -66,7 +69,7 @@ def checked(command: Callable[..., None]) -> Callable[..., None]:
             for option in options:
                 # the function that writes into a folder claims it; its name may have a dot as well
                 path = option.value
-                is_file = option.written and path.suffix and not path.is_dir()
+                is_file = option.is_written and path.suffix and not path.is_dir()
                 if is_file and path.parent.is_dir():
                     claims.enter_context(claim(path))
             command(*positional, **named)
@@ -81,8 +84,8 @@ def checked(command: Callable[..., None]) -> Callable[..., None]:
 
 
 def refuse_repeated(command: Callable[..., None], words: Iterable[str]) -> None:
-    """Refuse, with ``XResetError``, an option that takes several values and is given again, because only the last one
-    would count."""
+    """Refuse, with ``XResetError``, an option that takes several values or names an output, and is given again, because
+    only the last one would count."""
     flags = Counter(
         word.partition("=")[0].replace("_", "-") for word in words if word.startswith("--")
     )
@@ -90,6 +93,11 @@ def refuse_repeated(command: Callable[..., None], words: Iterable[str]) -> None:
     if not again:
         return
     for name, hint in get_type_hints(command, include_extras=True).items():
+        flag = f"--{name.replace('_', '-')}"
+        if flag in again and _names_output(marks_in(hint)):
+            raise XResetError(
+                f"{flag} is given more than once. Give the command once for each file."
+            )
         for flag in _flags_of_lists(f"--{name}", hint):
             if flag in again:
                 raise XResetError(
@@ -227,8 +235,6 @@ def _options_of(given: Mapping[str, Any], hints: Mapping[str, Any]) -> Iterator[
 def _check(option: _Option) -> None:
     """Refuse a value that is against the rules of the option's type."""
     check_value(option.flag, option.value, option.marks)
-    if option.written and option.written.suffix:
-        check_suffix(option.flag, option.value, option.written.suffix)
     for text in option.value if isinstance(option.value, tuple) else (option.value,):
         if isinstance(text, str | Path) and len(str(text)) > _LONGEST:
             raise XResetError(
@@ -241,14 +247,14 @@ def _check(option: _Option) -> None:
 def _check_overwriting(options: list[_Option]) -> None:
     """Refuse an output file that is another file of the command."""
     for option in options:
-        if not option.written or not isinstance(option.value, Path) or option.value.is_dir():
+        if not option.is_written or option.value.is_dir():
             continue
         for other in options:
             several = isinstance(other.value, list | tuple)
             files = other.value if several else [other.value]
             paths = [file.resolve() for file in files if isinstance(file, Path)]
             if other is not option and option.value.resolve() in paths:
-                use = f"is {other.flag} as well" if other.written else "the command reads"
+                use = f"is {other.flag} as well" if other.is_written else "the command reads"
                 raise XResetError(
                     f"{option.flag} is {option.value}, which {use}. Nothing was overwritten; choose another file."
                 )

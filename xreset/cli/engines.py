@@ -29,9 +29,8 @@ def list_() -> None:
 
 
 def _show_checks(runs: Sequence[Mapping[str, Any]], options: Mapping[str, Any]) -> None:
-    for file in (options["json"], options["page"]):
-        if file:
-            console.print(f"wrote {file}")
+    if options["out"]:
+        console.print(f"wrote {options['out']}")
     verdicts = []
     for run in runs:
         verdicts += [check["verdict"] for check in run["checks"]]
@@ -49,8 +48,8 @@ def _show_agreement(found: Parity, options: Mapping[str, Any]) -> None:
                 f"{tested.engine}: {tested.broken_worlds} worlds were not finite or dropped contacts",
                 style="bold red",
             )
-    if options["json"]:
-        console.print(f"wrote {options['json']}")
+    if options["out"]:
+        console.print(f"wrote {options['out']}")
     if found.missed:
         console.print(f"missed: {'; '.join(found.missed)}", style="bold red")
         raise SystemExit(1)

@@ -72,9 +72,6 @@ class Check:
 class Written:
     """Marks the path of a file or folder that a function writes, in its annotation."""
 
-    suffix: str = ""
-    """How the name of a file must end; empty: any way."""
-
 
 @dataclass(frozen=True)
 class Option:
@@ -83,10 +80,19 @@ class Option:
     name: str
 
 
+def _ends_in(*suffixes: str) -> Rule:
+    """Return the rule for the name of a file whose suffix decides what is written."""
+    expected = f"a name that ends in {' or '.join(suffixes)}"
+    return Rule(expected, lambda path: Path(path).suffix.lower() in suffixes)
+
+
 Output = Annotated[str | Path, Written()]
 """File or folder that a function writes."""
-Png = Annotated[str | Path, Written(".png")]
-Mp4 = Annotated[str | Path, Written(".mp4")]
+Json = Annotated[str | Path, Written(), _ends_in(".json")]
+JsonOrPage = Annotated[str | Path, Written(), _ends_in(".json", ".md")]
+Mp4 = Annotated[str | Path, Written(), _ends_in(".mp4")]
+Png = Annotated[str | Path, Written(), _ends_in(".png")]
+PngOrMp4 = Annotated[str | Path, Written(), _ends_in(".png", ".mp4")]
 Positive = Annotated[T, Rule("a number above 0 and finite", lambda x: 0 < x < inf)]
 """JSON, and so a run's configuration, has no infinity."""
 NotNegative = Annotated[T, Rule("a number from 0 to 1e15", lambda x: 0 <= x <= 1e15)]

@@ -272,14 +272,13 @@ def code_version() -> str:
 
 
 def this_command() -> str:
-    """Return the running command as text, without the folders of files and the files of the results."""
+    """Return the running command as text, without the folders of files and the file of the results."""
     if not INVOCATION:
         return "a program that uses xreset"
     words = list(INVOCATION)
-    for flag in ("--json", "--page"):
-        if flag in words:
-            i = words.index(flag)
-            del words[i : i + 2]
+    if "--out" in words:
+        i = words.index("--out")
+        del words[i : i + 2]
     names = [Path(word).name if Path(word).exists() else word for word in words]
     return shlex.join(["xreset", *names])
 

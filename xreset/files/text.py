@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import reprlib
 from collections.abc import Sequence
+from pathlib import PurePath
 from typing import Any
 
 _LISTED = 8
@@ -17,8 +18,10 @@ _REPR.maxother = 80
 
 
 def shown(value: Any) -> str:
-    """Return a value as Python writes it, in one line and shortened: the content of a file may have any size."""
+    """Return a value as Python writes it, in one line and shortened: the content of a file may have any size. A path is
+    shown as a text."""
     try:
+        value = str(value) if isinstance(value, PurePath) else value
         text = re.sub(r"\n\s*", " ", _REPR.repr(value))
     except ValueError:  # Python refuses to write thousands of digits
         text = "a number of thousands of digits"

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from xreset.errors import ObjectError, XResetError
-from xreset.files.checks import Mp4, NonNegativeInt, Output, Png, Port, obeys_rules
+from xreset.files.checks import NonNegativeInt, Output, Png, PngOrMp4, Port, obeys_rules
 from xreset.files.progress import unseen
 from xreset.files.storage import write_whole
 from xreset.files.text import quantity
@@ -39,8 +39,7 @@ def view(
     frame: NonNegativeInt | None = None,
     host: str = "127.0.0.1",
     port: Port = 8080,
-    png: Png | None = None,
-    mp4: Mp4 | None = None,
+    out: PngOrMp4 | None = None,
     say: Callable[[str], None] = print,
     note: Callable[[str], None] = _warn,
     progress: Callable[[str, float, int], None] = unseen,
@@ -57,11 +56,10 @@ def view(
         robot: name or folder of the robot; default: the file's.
         sequence: index of the sequence, from 0. Default: the first; in a bank, all sequences.
         frame: index of the frame in the sequence (or of the state in the bank). Default: the first one with a hand;
-            for --png the middle one.
+            for a picture the middle one.
         host: address to serve at; 0.0.0.0 allows other machines.
         port: port to serve at; if it is taken, the next free one.
-        png: picture to write, instead of a page.
-        mp4: film of the sequence to write, instead of a page.
+        out: file to write in place of a page: a picture (.png), or a film of the sequence (.mp4).
         say: called with the address of the page, or with what the picture shows.
         note: called with each doubt about the demonstrations.
         progress: called with ("drawing", frames of the film drawn, frames in all).
@@ -75,14 +73,19 @@ def view(
     shown = load_view(file, demos=demos, robot=robot, meshes=meshes)
     for text in shown.notes:
         note(text)
-    if png is None and mp4 is None:
+    if out is None:
         _serve(shown, host, port, sequence, frame, say)
         return
+    path = Path(out)
+    if frame is not None and path.suffix.lower() == ".mp4":
+        raise XResetError(
+            "A film has all frames of a sequence. Leave out the frame, or end the name in .png."
+        )
     rows = shown.choose(sequence=sequence if sequence is not None or not shown.is_motion else 0)
-    if png is not None:
-        _write_png(Path(png), shown, rows, frame, say)
-    if mp4 is not None:
-        _write_mp4(Path(mp4), shown, rows, say, progress)
+    if path.suffix.lower() == ".png":
+        _write_png(path, shown, rows, frame, say)
+    else:
+        _write_mp4(path, shown, rows, say, progress)
 
 
 def _serve(

@@ -49,7 +49,7 @@ class WebPage:
             XResetError: viser is not installed, the port is impossible, or the server does not start.
         """
         check_port(port)
-        with needs("viser, without which --png and --mp4 of xreset view work,", "viewer"):
+        with needs("viser, without which --out of xreset view works,", "viewer"):
             import viser
         try:
             with _own_page_only(host) as guarded:

@@ -49,21 +49,16 @@ def run(options: Options, console: Console) -> None:
     )
 
     above = [path.annotated & (path.root_pos[..., 2] > 0) for path in paths]
-    solved = torch.cat(
-        [_follows(found, 1e9)[mask] for found, mask in zip(measures, above, strict=True)]
-    )
-    free = torch.cat(
-        [
-            _follows(found, SOLVED.table_depth)[mask]
-            for found, mask in zip(measures, above, strict=True)
-        ]
-    )
+
+    def of_frames(depth: float) -> torch.Tensor:
+        rows = [_follows(found, depth)[mask] for found, mask in zip(measures, above, strict=True)]
+        return torch.cat(rows)
+
+    solved = of_frames(1e9)
+    free = of_frames(SOLVED.table_depth)
     chosen = torch.as_tensor(np.random.default_rng(0).permutation(len(free))[:_SAMPLE])
-    fields = {}
-    for name in vars(paths[0]):
-        parts = [getattr(path, name)[mask] for path, mask in zip(paths, above, strict=True)]
-        fields[name] = torch.cat(parts)[chosen][:, None]
-    alone = ArmTargets(**fields)
+    alone = ArmTargets.cat([path[mask] for path, mask in zip(paths, above, strict=True)])
+    alone = alone[chosen].map(lambda x: x[:, None])
     config = replace(ArmSearch(), restarts=16, reseeds=0, collision_weight=0.0)
     within = _follows(
         track(model, alone, replace(SOLVED, table_depth=1e9, self_depth=1e9), config)[1], 1e9

@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal
 from unittest import mock
@@ -60,12 +60,7 @@ def run(options: Options, console: Console) -> None:
     task = TaskConfig()
     scene = make_scene(robot, tuple(load_objects([OBJECT], None)), task)
     grasp = held_grasp(robot, scene.objects)
-    grasp = State(
-        **{
-            f.name: getattr(grasp, f.name).expand(options.num_envs, -1).contiguous()
-            for f in fields(State)
-        }
-    )
+    grasp = grasp.map(lambda x: x.expand(options.num_envs, -1).contiguous())
     pools = sorted({1, min(2, usable_cores()), min(usable_cores(), options.num_envs)})
     processes = []
     for n in pools:
@@ -143,9 +138,7 @@ def _pooled(
 
         def start() -> None:
             for i, world in enumerate(worlds):
-                world.set_state(
-                    {f.name: getattr(grasp, f.name)[i].double().numpy() for f in fields(State)}
-                )
+                world.set_state({name: x[i].double().numpy() for name, x in vars(grasp).items()})
             for _ in range(_SETTLE):
                 _each(raw["state"])
             for backend in backends:

@@ -102,12 +102,9 @@ def held_grasp(robot: RobotSpec, objects: Sequence[ObjectSpec]) -> State:
     hand = torch.tensor([joint.group == "hand" for joint in robot.joints])
     stiffness = torch.tensor([joint.drive.kp for joint in robot.joints], dtype=torch.float64)
     target = position.detach() - torch.where(hand, _PRESS * position.grad / stiffness, 0.0)
-    return State(
-        joint_pos=position.detach()[None].float(),
-        joint_vel=torch.zeros(1, len(robot.joints)),
-        joint_target=target[None].float(),
-        object_pos=center[None].float(),
-        object_quat=torch.as_tensor(moved.object_quat_wxyz[frame], dtype=torch.float32)[None],
-        object_linvel=torch.zeros(1, 3),
-        object_angvel=torch.zeros(1, 3),
+    return State.at_rest(
+        position.detach()[None],
+        center[None],
+        torch.as_tensor(moved.object_quat_wxyz[frame])[None],
+        target[None],
     )

@@ -23,7 +23,7 @@ from xreset.files.checks import (
     Seed,
     obeys_rules,
 )
-from xreset.files.progress import unseen
+from xreset.files.progress import NamedProgress, Progress, unseen
 from xreset.files.storage import claim_folder
 from xreset.files.text import quantity
 from xreset.physics.plugins import Device
@@ -55,7 +55,7 @@ def evaluate(
     device: Device = "cpu",
     num_envs: PositiveInt = 64,
     out: Output | None = None,
-    progress: Callable[[str, float, int], None] = unseen,
+    progress: NamedProgress = unseen,
 ) -> Evaluation:
     """Evaluate a policy or a baseline in one or several engines, from the same starts.
 
@@ -127,7 +127,7 @@ def stress(
     device: Device = "cpu",
     num_envs: PositiveInt = 64,
     out: Output | None = None,
-    progress: Callable[[str, float, int], None] = unseen,
+    progress: NamedProgress = unseen,
 ) -> Evaluation:
     """Measure robustness: the same episodes with changed stiffness, latency, friction, mass and more, one at a time.
 
@@ -206,7 +206,7 @@ def make_report(
     robot: str | Path | None = None,
     meshes: str | Path | None = None,
     film: Mp4 | None = None,
-    progress: Callable[[str, float, int], None] = unseen,
+    progress: NamedProgress = unseen,
 ) -> Report:
     """Make a self-contained HTML page of a run's evaluations, or of several runs side by side, and its figures as CSV.
 
@@ -376,7 +376,7 @@ def export_episodes(
     video: bool = True,
     size: tuple[int, int] = (320, 240),
     cameras: Annotated[Sequence[str], Option("camera")] = (),
-    progress: Callable[[float, int], None] = unseen,
+    progress: Progress = unseen,
 ) -> RecordedEpisodes:
     """Write recorded evaluation episodes as a LeRobot data set (v3.0), or as plain arrays in an npz file.
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from xreset.files.checks import Json, JsonOrPage, Option, PositiveInt, obeys_rules
-from xreset.files.progress import unseen
+from xreset.files.progress import NamedProgress, unseen
 from xreset.files.storage import file_hash, measured, write_json, write_whole
 from xreset.physics.plugins import Device
 
@@ -78,7 +78,7 @@ def compare_engines(
     grasps: PositiveInt = 48,
     device: Device = "cpu",
     out: Json | None = None,
-    progress: Callable[[str, float, int], None] = unseen,
+    progress: NamedProgress = unseen,
 ) -> Parity:
     """Measure how far physics engines agree with MuJoCo on grasps. The command exits with 1 if one misses a target.
 

@@ -21,7 +21,7 @@ from xreset.errors import XResetError, needs
 from xreset.eval.export.recorded import SCHEMA, RecordedEpisodes
 from xreset.eval.report.clips import draw_state, draw_view, policy_cameras
 from xreset.eval.results import Trace
-from xreset.files.progress import unseen
+from xreset.files.progress import Progress, unseen
 from xreset.files.storage import atomic_folder, write_json
 from xreset.objects.catalogue import load_object
 from xreset.pictures.render import Renderer, Size, encode_mp4
@@ -48,7 +48,7 @@ def write_lerobot(
     video: bool = True,
     size: Size = (320, 240),
     cameras: Sequence[str] = (),
-    progress: Callable[[float, int], None] = unseen,
+    progress: Progress = unseen,
 ) -> None:
     """Write a data set; ``docs/rollouts.md`` has its features.
 
@@ -84,7 +84,7 @@ def _write(
     recording: RecordedEpisodes,
     videos: tuple[str, ...],
     size: Size,
-    progress: Callable[[float, int], None],
+    progress: Progress,
 ) -> None:
     offsets = recording.offsets
     task_index, tasks = pd.factorize(recording.episodes["task"])

@@ -22,7 +22,7 @@ from xreset.files.checks import (
     frozen,
     obeys_rules,
 )
-from xreset.files.progress import unseen
+from xreset.files.progress import Progress, unseen
 from xreset.files.storage import file_hash
 
 if TYPE_CHECKING:
@@ -32,9 +32,7 @@ else:  # a command has files in place of these
 
 
 @obeys_rules
-def import_dexycb(
-    folder: str | Path, out: Output, *, progress: Callable[[float, int], None] = unseen
-) -> Demos:
+def import_dexycb(folder: str | Path, out: Output, *, progress: Progress = unseen) -> Demos:
     """Read DexYCB in its own layout and write an archive of demonstrations.
 
     Args:
@@ -125,7 +123,7 @@ def synthesize(
     fps: float = 30.0,
     side: Literal["right", "left", "both"] = "right",
     meshes: str | Path | None = None,
-    progress: Callable[[float, int], None] = unseen,
+    progress: Progress = unseen,
 ) -> Demos:
     """Synthesize demonstrations: reach, grasp, lift, turn.
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from xreset.errors import ObjectError, XResetError
 from xreset.files.checks import NonNegativeInt, Output, Png, PngOrMp4, Port, obeys_rules
-from xreset.files.progress import unseen
+from xreset.files.progress import NamedProgress, unseen
 from xreset.files.storage import write_whole
 from xreset.files.text import quantity
 from xreset.objects.properties import Properties
@@ -42,7 +42,7 @@ def view(
     out: PngOrMp4 | None = None,
     say: Callable[[str], None] = print,
     note: Callable[[str], None] = _warn,
-    progress: Callable[[str, float, int], None] = unseen,
+    progress: NamedProgress = unseen,
 ) -> None:
     """Show demonstrations, robot motion, a reset bank or a goal set in a browser, or write pictures of them.
 
@@ -127,7 +127,7 @@ def _write_mp4(
     shown: View,
     rows: np.ndarray,
     say: Callable[[str], None],
-    progress: Callable[[str, float, int], None],
+    progress: NamedProgress,
 ) -> None:
     from xreset.pictures.render import encode_mp4
     from xreset.pictures.view.picture import Drawer
@@ -155,7 +155,7 @@ def import_objects(
     mass: float | None = None,
     friction: float | None = None,
     png: Png | None = None,
-    progress: Callable[[str, float, int], None] = unseen,
+    progress: NamedProgress = unseen,
 ) -> list[Import]:
     """Cut a mesh, or every mesh of a folder, into convex pieces, and keep them for later runs.
 

@@ -9,7 +9,7 @@ Shape letters: L states of a bank, K grasps, J hand joints, N tried grasps, S de
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from xreset.files.checks import frozen
+from xreset.files.progress import Progress
 from xreset.geometry.rotations import (
     homogeneous,
     matvec,
@@ -126,8 +127,8 @@ def grasps_of_bank(bank: ResetBank, robot: RobotSpec, name: str) -> Grasps:
 def planned_grasps(model: HandModel, obj: ObjectSpec) -> Grasps:
     """Plan grasps of a jaw, at most 800, in random order; the same arguments give the same grasps."""
     surface = prepared_surface(obj)
-    jaw = _Jaw(model)
-    pairs = _pairs(surface, jaw.widest - 2 * _GAP)
+    jaw = _Jaw.of(model)
+    pairs = _pairs(surface, float(jaw.opening[-1]) - 2 * _GAP)
     generator = torch.Generator().manual_seed(0)
     if not len(pairs):
         nothing = model.home.new_zeros(0, len(model.home))
@@ -154,10 +155,26 @@ def planned_grasps(model: HandModel, obj: ObjectSpec) -> Grasps:
     return Grasps.cat(found)[:_MOST]
 
 
-class _Jaw:
-    """How a jaw's pads move with its joint, in the frame of the hand's root."""
+@frozen
+class _Jaw(Tensors):
+    """How a jaw's pads move with its joint, in Q positions from closed to open, in the frame of the hand's root."""
 
-    def __init__(self, model: HandModel) -> None:
+    opening: Tensor
+    """[Q] distance between the pads [m]."""
+    joints: Tensor
+    """[Q, J] of the hand."""
+    middle: Tensor
+    """[Q, 3] point between the pads."""
+    across: Tensor
+    """[Q, 3] unit vector from the thumb's pad to the finger's."""
+    ahead: Tensor
+    """[Q, 3] unit vector of approach."""
+    reach: Tensor
+    """[Q] how far the pads reach beyond their middle [m]."""
+
+    @staticmethod
+    def of(model: HandModel) -> _Jaw:
+        """Move a hand's jaw through its range."""
         balls = model.balls
         kinematics = model.kinematics
         share = torch.linspace(0, 1, 257, dtype=model.home.dtype)[:, None]
@@ -169,32 +186,28 @@ class _Jaw:
         is_thumb = torch.tensor([link in of_thumb for link in balls.links])
         thumb = is_thumb[balls.link[model.pad_balls]]
         across = centers[:, ~thumb].mean(dim=1) - centers[:, thumb].mean(dim=1)
-        self.across = torch.nn.functional.normalize(across, dim=-1)
-        """[Q, 3] unit vector from the thumb's pad to the finger's."""
+        across = torch.nn.functional.normalize(across, dim=-1)
         radii = balls.radii[model.pad_balls]
-        along = (centers * self.across[:, None]).sum(-1)
+        along = (centers * across[:, None]).sum(-1)
         low = (along + radii)[:, thumb].amax(dim=1)
         high = (along - radii)[:, ~thumb].amin(dim=1)
         opening = high - low
-        middle = centers[:, thumb].mean(dim=1) + centers[:, ~thumb].mean(dim=1)
-        middle = middle / 2
-        middle = middle + ((high + low) / 2 - (middle * self.across).sum(-1))[:, None] * self.across
+        middle = (centers[:, thumb].mean(dim=1) + centers[:, ~thumb].mean(dim=1)) / 2
+        middle = middle + ((high + low) / 2 - (middle * across).sum(-1))[:, None] * across
         palm = kinematics.link_poses(joints, [model.robot.palm])[:, 0, :3, 3]
         ahead = middle - palm
-        ahead = ahead - (ahead * self.across).sum(-1, keepdim=True) * self.across
-        self.ahead = torch.nn.functional.normalize(ahead, dim=-1)
-        """[Q, 3] unit vector of approach."""
-        reach = ((centers - middle[:, None]) * self.ahead[:, None]).sum(-1) + radii
-        self.reach = reach.amax(dim=1)
-        """[Q] how far the pads reach beyond their middle [m]."""
-        order = opening.argsort()
-        self.opening = opening[order].contiguous()
-        self.joints = joints[order]
-        self.middle = middle[order]
-        self.across = self.across[order]
-        self.ahead = self.ahead[order]
-        self.reach = self.reach[order]
-        self.widest = float(self.opening[-1])
+        ahead = ahead - (ahead * across).sum(-1, keepdim=True) * across
+        ahead = torch.nn.functional.normalize(ahead, dim=-1)
+        reach = ((centers - middle[:, None]) * ahead[:, None]).sum(-1) + radii
+        jaw = _Jaw(
+            opening=opening,
+            joints=joints,
+            middle=middle,
+            across=across,
+            ahead=ahead,
+            reach=reach.amax(dim=1),
+        )
+        return jaw[opening.argsort()]
 
     def grasps(self, pairs: Tensor, angle: Tensor, depth: Tensor) -> Grasps:
         """Return grasps [N] of pairs of points [N, 2, 3], approached at an angle [N] about their line."""
@@ -280,7 +293,7 @@ def losses(
     robot: RobotSpec,
     objects: Sequence[ObjectSpec],
     *,
-    progress: Callable[[float, int], None],
+    progress: Progress,
 ) -> np.ndarray:
     """Return why each demonstration [S] of a bank cannot be followed with a rigid grasp, empty where it can.
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from xreset.files.checks import Option, Output, PositiveInt, obeys_rules
-from xreset.files.progress import unseen
+from xreset.files.progress import NamedProgress, Progress, unseen
 from xreset.physics.plugins import Device
 from xreset.resets.config import (
     ClosingConfig,
@@ -50,7 +50,7 @@ def make_bank(
     closing: ClosingConfig | None = ClosingConfig(),
     squeeze: SqueezeConfig | None = SqueezeConfig(),
     transfer: TransferConfig | None = TransferConfig(),
-    progress: Callable[[str, float, int], None] = unseen,
+    progress: NamedProgress = unseen,
     note: Callable[[str], None] = _warn,
 ) -> ResetBank:
     """Test retargeted states in physics and keep the stable ones; then add states in grasps of other demonstrations.
@@ -150,7 +150,7 @@ def make_goals(
     families: Annotated[str | Sequence[str] | None, Option("family")] = None,
     poses: Annotated[Sequence[Pose], Option("pose")] = (),
     config: Annotated[GoalConfig | None, Option("draw")] = GoalConfig(),
-    progress: Callable[[float, int], None] = unseen,
+    progress: Progress = unseen,
 ) -> GoalSet:
     """Give objects starts and goals without demonstrations, for xreset eval --demos and xreset train --goals.
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from xreset.files.checks import Option, Output, obeys_rules
-from xreset.files.progress import unseen
+from xreset.files.progress import Progress, unseen
 from xreset.files.storage import file_hash
 from xreset.physics.plugins import Device
 
@@ -38,7 +38,7 @@ def retarget_demos(
     meshes: str | Path | None = None,
     trust: Annotated[bool, Option("trust_recordings")] = False,
     device: Device = "cpu",
-    progress: Callable[[float, int], None] = unseen,
+    progress: Progress = unseen,
     note: Callable[[str], None] = _warn,
 ) -> Retargeted:
     """Turn human demonstrations into robot motion.

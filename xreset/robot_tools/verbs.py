@@ -5,13 +5,13 @@ They import most of what they need when they are called, because the help of a c
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from xreset.files.checks import Option, Output, Png, PositiveInt, obeys_rules
-from xreset.files.progress import unseen
+from xreset.files.progress import NamedProgress, Progress, unseen
 from xreset.files.storage import this_command
 from xreset.physics.plugins import Device
 from xreset.resets.config import SqueezeConfig
@@ -115,7 +115,7 @@ def place_robot(
     meshes: str | Path | None = None,
     write: bool = False,
     search: PlaceConfig = PlaceConfig(),
-    progress: Callable[[str, float, int], None] = unseen,
+    progress: NamedProgress = unseen,
 ) -> list[Finalist]:
     """Find the base placement from which a robot's arm follows most of the demonstrations.
 
@@ -167,7 +167,7 @@ def judge(
     squeeze: SqueezeConfig = SqueezeConfig(),
     device: Device = "cpu",
     picture: Png | None = None,
-    progress: Callable[[float, int], None] = unseen,
+    progress: Progress = unseen,
 ) -> Judgement:
     """Judge a robot without training: which objects it holds for a second at full gravity, lifts and turns.
 

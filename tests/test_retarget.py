@@ -449,8 +449,19 @@ class PipelineTest(InOneFolder):
         assert_array_equal(self.result.goal_pos[1], self.result.object_pos[-1])
 
     def test_a_file_comes_back_and_the_same_inputs_give_the_same_file(self):
+        """With any number of threads, of which the hand uses one."""
         file = self.write("a.npz", self.result)
-        again = retarget_demos(self.demos, self.robot, self.objects, self.config)
+        self.addCleanup(torch.set_num_threads, torch.get_num_threads())
+        torch.set_num_threads(2)
+        threads = []
+
+        def counted(*parts):
+            threads.append(torch.get_num_threads())
+            return retarget_hand(*parts)
+
+        with patch("xreset.retarget.pipeline.retarget_hand", counted):
+            again = retarget_demos(self.demos, self.robot, self.objects, self.config)
+        self.assertEqual((threads, torch.get_num_threads()), ([1], 2))
         self.assertEqual(self.write("b.npz", again).read_bytes(), file.read_bytes())
         back = read_retargeted(file)
         for name, value in vars(self.result).items():

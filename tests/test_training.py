@@ -742,7 +742,18 @@ class TrainingTest(WithBank):
             "gloo", store=torch.distributed.HashStore(), rank=0, world_size=1
         )
         self.addCleanup(torch.distributed.destroy_process_group)
-        self.train("polite", config=ONE)
+        self.addCleanup(torch.set_num_threads, torch.get_num_threads())
+        torch.set_num_threads(2)
+        threads = []
+        iterate = TrainingRunner._iterate
+
+        def counted(runner, *parts):
+            threads.append(torch.get_num_threads())
+            return iterate(runner, *parts)
+
+        with patch.object(TrainingRunner, "_iterate", counted):
+            self.train("polite", config=ONE)
+        self.assertEqual((threads, torch.get_num_threads()), ([1], 2))
         self.assertEqual(torch.get_float32_matmul_precision(), "medium")
         self.assertTrue(torch.distributed.is_initialized())
 

@@ -168,7 +168,8 @@ class EngineTest:
     def test_checks_of_the_suite(self):  # pyright: ignore[reportGeneralTypeIssues]
         for result in run(self.make, only=self.checks.split()):
             with self.subTest(result.name):
-                self.assertEqual(result.verdict, "passed", f"{result.worst} {result.problem}")
+                said = f"{result.worst} {result.problem}"
+                self.assertIn(result.verdict, ("passed", "known difference"), said)
         for known in self.backend.known_differences:
             self.assertIn(known.check, {check.name for check in CHECKS})
 

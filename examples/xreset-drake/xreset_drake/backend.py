@@ -25,6 +25,7 @@ from xreset.backends.rigid import (
     OTHER_LINK,
     TABLE,
     Inertia,
+    MovingJoints,
     mechanism,
     nearer,
     object_inertia,
@@ -40,13 +41,11 @@ try:
     from pydrake.multibody.math import SpatialForce
     from pydrake.multibody.plant import CoulombFriction, ExternallyAppliedSpatialForce
     from pydrake.systems.analysis import Simulator
-    from pydrake.systems.framework import Context
 except ImportError as error:
     raise unavailable("pydrake", "drake", error) from error
 
 from xreset_drake.model import (
     OBJECT_FRICTION,
-    DrakeModel,
     DrakeSettings,
     build_model,
     friction_of_other,
@@ -69,13 +68,7 @@ class DrakeWorld(World):
         self._at = at = build_model(scene, robot, obj, self._inertia, settings)
         self._internal_steps = settings.internal_steps
         self._dt = scene.timestep / settings.internal_steps
-        mimics = scene.robot.mimics
-        self._source = np.array(
-            [scene.robot.joint_names.index(mimic.source) for mimic in mimics], dtype=int
-        )
-        self._multiplier = np.array([mimic.multiplier for mimic in mimics])
-        self._offset = np.array([mimic.offset for mimic in mimics])
-        self._brake = _Brake(scene)
+        self._joints = MovingJoints(scene.robot, robot.joint_names)
 
         self._simulator = Simulator(at.diagram)
         self._root = self._simulator.get_mutable_context()
@@ -100,10 +93,7 @@ class DrakeWorld(World):
         i = self._object_q
         j = self._object_v
         q, v = (np.zeros(size) for size in self._sizes)
-        q[at.joint_position] = state["joint_pos"]
-        v[at.joint_velocity] = state["joint_vel"]
-        q[at.mimic_position] = self._multiplier * state["joint_pos"][self._source] + self._offset
-        v[at.mimic_velocity] = self._multiplier * state["joint_vel"][self._source]
+        q[at.position], v[at.velocity] = self._joints.spread(state["joint_pos"], state["joint_vel"])
         self._quat = state["object_quat"] / np.linalg.norm(state["object_quat"])
         q[i : i + 4] = self._quat
         q[i + 4 : i + 7] = state["object_pos"]
@@ -129,8 +119,8 @@ class DrakeWorld(World):
         q, v = np.split(values, self._sizes[:1])
         self._quat = nearer(q[i : i + 4], self._quat)
         return {
-            "joint_pos": q[at.joint_position],
-            "joint_vel": v[at.joint_velocity],
+            "joint_pos": q[at.position[self._joints.driven]],
+            "joint_vel": v[at.velocity[self._joints.driven]],
             "joint_target": self._target,
             "object_pos": q[i + 4 : i + 7],
             "object_quat": self._quat,
@@ -142,7 +132,7 @@ class DrakeWorld(World):
         """See :meth:`World.set_joint_targets`."""
         self._target = np.array(targets)
         desired = np.zeros(2 * len(targets))  # positions, then velocities
-        desired[self._at.joint_actuator] = targets
+        desired[self._at.actuator] = targets
         self._at.plant.get_desired_state_input_port(self._at.robot).FixValue(self._context, desired)
 
     def step(self, n: int) -> None:
@@ -157,23 +147,39 @@ class DrakeWorld(World):
         at.plant.get_applied_spatial_force_input_port().FixValue(
             self._context, Value[list[ExternallyAppliedSpatialForce]]([load])
         )
-        for count in (
-            [1] * (n * self._internal_steps) if self._brake.needed else [n * self._internal_steps]
-        ):
-            if self._brake.needed:
-                self._brake.apply(at, self._context, self._target, self._dt)
-            self._steps += count
+        steps = n * self._internal_steps
+        at_once = 1 if self._joints.has_dry_friction else steps
+        for _ in range(steps // at_once):
+            if self._joints.has_dry_friction:
+                self._brake()
+            self._steps += at_once
             try:
                 self._simulator.AdvanceTo(self._steps * self._dt)
-            except (
-                RuntimeError
-            ) as error:  # its way to say that numbers have grown beyond all bounds
+            except RuntimeError as error:  # it says so that numbers grow beyond all bounds
                 warnings.warn(
                     f"Drake gives up on a world, which counts as not finite from now on: {error}",
                     stacklevel=2,
                 )
                 self._lost = np.full(sum(self._sizes), np.nan)
                 return
+
+    def _brake(self) -> None:
+        """Set the torques of dry friction for one step, which Drake lacks.
+
+        They are what would bring the joints to rest within the step, as far as the friction loss allows; contacts are not foreseen.
+        """
+        plant = self._at.plant
+        joints = self._joints
+        stiffness, damping, effort = joints.nominal
+        row = self._at.velocity[joints.driven]
+        position = plant.GetPositions(self._context)[self._at.position[joints.driven]]
+        velocity = plant.GetVelocities(self._context)[row]
+        drive = stiffness * (self._target - position) - damping * velocity
+        felt = 1.0 / np.diag(np.linalg.inv(plant.CalcMassMatrix(self._context)))[row]
+        stopping = -felt * velocity / self._dt - np.clip(drive, -effort, effort)
+        torque = np.zeros(plant.num_velocities())
+        torque[row] = np.clip(stopping, -joints.friction_loss, joints.friction_loss)
+        plant.get_applied_generalized_force_input_port().FixValue(self._context, torque)
 
     def links(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """See :meth:`World.links`."""
@@ -330,32 +336,3 @@ class DrakeBackend(PoolBackend):
     def engine_version(cls) -> str:
         """See :meth:`Backend.engine_version`."""
         return version("drake")
-
-
-class _Brake:
-    """Dry friction of the joints, which Drake lacks, as a torque.
-
-    It is what would bring the joint to rest within the step, as far as the friction loss allows; contacts are not foreseen.
-    """
-
-    def __init__(self, scene: SceneSpec) -> None:
-        drives = [joint.drive for joint in scene.robot.joints]
-        self._kp = np.array([drive.kp for drive in drives])
-        self._kd = np.array([drive.kd for drive in drives])
-        self._effort = np.array([drive.effort for drive in drives])
-        self._loss = np.array([drive.friction_loss for drive in drives])
-        self.needed = bool(self._loss.any())
-
-    def apply(self, at: DrakeModel, context: Context, target: np.ndarray, dt: float) -> None:
-        """Set the torques of one step."""
-        plant = at.plant
-        joints = at.joint_velocity
-        position = plant.GetPositions(context)[at.joint_position]
-        velocity = plant.GetVelocities(context)[joints]
-        drive = np.clip(
-            self._kp * (target - position) - self._kd * velocity, -self._effort, self._effort
-        )
-        felt = 1.0 / np.diag(np.linalg.inv(plant.CalcMassMatrix(context)))[joints]
-        torque = np.zeros(plant.num_velocities())
-        torque[joints] = np.clip(-felt * velocity / dt - drive, -self._loss, self._loss)
-        plant.get_applied_generalized_force_input_port().FixValue(context, torque)

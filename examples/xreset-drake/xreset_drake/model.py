@@ -81,22 +81,18 @@ class Surface:
 
 @dataclass(frozen=True, kw_only=True)
 class DrakeModel:
-    """A finished diagram, and where the scene's parts are in it. Letters: J actuated joints, Q mimic joints, K tracked links."""
+    """A finished diagram, and where the scene's parts are in it. Letters: D moving joints, J actuated joints, K tracked links."""
 
     diagram: Diagram
     plant: MultibodyPlant
     scene_graph: SceneGraph
     robot: ModelInstanceIndex
-    joint_position: np.ndarray
-    """[J] where the actuated joints are in the plant's position vector."""
-    joint_velocity: np.ndarray
-    """[J] and in its velocity vector."""
-    joint_actuator: np.ndarray
-    """[J] and among the robot's actuators."""
-    mimic_position: np.ndarray
-    """[Q]"""
-    mimic_velocity: np.ndarray
-    """[Q]"""
+    position: np.ndarray
+    """[D] where the moving joints, in the mechanism's order, are in the plant's position vector."""
+    velocity: np.ndarray
+    """[D] and in its velocity vector."""
+    actuator: np.ndarray
+    """[J] where the actuated joints are among the robot's actuators."""
     links: Sequence[Frame]
     """[K] frames of the tracked links."""
     moving: Sequence[RigidBody]
@@ -145,24 +141,17 @@ def build_model(
     _filter_collisions(scene_graph, parts, robot)
     diagram = builder.Build()
 
-    joints = [plant.GetJointByName(name, instance) for name in scene.robot.joint_names]
-    mimics = [plant.GetJointByName(mimic.joint, instance) for mimic in scene.robot.mimics]
+    joints = [plant.GetJointByName(name, instance) for name in robot.joint_names]
     actuators = list(plant.GetJointActuatorIndices(instance))
+    driven = [plant.GetJointActuatorByName(name, instance) for name in scene.robot.joint_names]
     return DrakeModel(
         diagram=diagram,
         plant=plant,
         scene_graph=scene_graph,
         robot=instance,
-        joint_position=np.array([joint.position_start() for joint in joints], dtype=int),
-        joint_velocity=np.array([joint.velocity_start() for joint in joints], dtype=int),
-        joint_actuator=np.array(
-            [
-                actuators.index(plant.GetJointActuatorByName(joint.name(), instance).index())
-                for joint in joints
-            ]
-        ),
-        mimic_position=np.array([joint.position_start() for joint in mimics], dtype=int),
-        mimic_velocity=np.array([joint.velocity_start() for joint in mimics], dtype=int),
+        position=np.array([joint.position_start() for joint in joints]),
+        velocity=np.array([joint.velocity_start() for joint in joints]),
+        actuator=np.array([actuators.index(actuator.index()) for actuator in driven]),
         links=[
             plant.GetFrameByName(_frame_name(link), instance) for link in scene.robot.tracked_links
         ],
@@ -313,8 +302,7 @@ def _filter_collisions(scene_graph: SceneGraph, parts: _Parts, robot: Mechanism)
 
 def spatial_inertia(inertia: Inertia) -> SpatialInertia:
     """Mass properties about the origin of the body's frame, which is where Drake wants them."""
-    R = RotationMatrix(Quaternion(_unit(inertia.quat))).matrix()
-    about_com = R @ np.diag(inertia.moments) @ R.T
+    about_com = inertia.matrix
     rotational = RotationalInertia(
         *np.diag(about_com), about_com[0, 1], about_com[0, 2], about_com[1, 2]
     )

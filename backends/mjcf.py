@@ -330,8 +330,7 @@ def _add_drives(
 ) -> None:
     """Add the drives and the mimic joints; a drive whose joint others follow acts on all of them through a tendon, with
     the shares of :func:`~xreset.geometry.dynamics.drive_shares`."""
-    offset = np.zeros(joints.count)
-    offset[joints.mimic] = joints.offset
+    _, offset = joints.couplings
     for joint, shares in zip(scene.robot.joints, joints.shares, strict=True):
         drive = joint.drive
         along = np.flatnonzero(shares)

@@ -43,6 +43,15 @@ class File:
         }
 
     @property
+    def other_side(self):
+        return {"right": "left", "left": "right"}[self.side]
+
+    def of(self, rows, **changes):
+        """The file with some of its frames."""
+        parts = {name: getattr(self, name)[rows] for name in ("points", "pos", "turn")}
+        return replace(self, **parts | changes)
+
+    @property
     def convention(self):
         """What the user says."""
         frame = "table" if self.camera is None else "camera"
@@ -83,6 +92,13 @@ def matrix(turn=None, shift=(0.0, 0.0, 0.0)):
     return T
 
 
+def with_rows(values, rows, new):
+    """A copy of an array with other values in some rows."""
+    changed = values.copy()
+    changed[rows] = new
+    return changed
+
+
 def about(axis, degrees, center=(0.0, 0.0, 0.0)):
     """A rotation about an axis through a point."""
     turn = matrix(Rotation.from_euler(axis, degrees, degrees=True).as_matrix())
@@ -115,8 +131,7 @@ def camera_files(file):
     turn = Rotation.from_matrix(to_camera[:3, :3]).inv() * seen.turn
     yield "camera: object's orientation in the table's frame", replace(seen, turn=turn)
     mirror = matrix(np.diag([-1.0, 1.0, 1.0]))
-    other_side = {"right": "left", "left": "right"}[file.side]
-    yield "camera: mirrored hand", replace(moved(seen, mirror), side=other_side)
+    yield "camera: mirrored hand", replace(moved(seen, mirror), side=file.other_side)
     quats = np.roll(seen.turn.as_quat(scalar_first=True), -1, axis=1)
     yield "camera: quaternions (x, y, z, w)", replace(seen, turn=turn_of(quats))
 
@@ -145,13 +160,12 @@ def hand_files(file, rng):
     """Yield name and file of errors of the hand's numbers."""
     points = file.points
     wrist = points[:, :1]
-    other_side = {"right": "left", "left": "right"}[file.side]
     for axis in range(3):
         mirror = np.eye(3)
         mirror[axis, axis] = -1.0
-        mirrored = replace(moved(file, matrix(mirror)), side=other_side)
+        mirrored = replace(moved(file, matrix(mirror)), side=file.other_side)
         yield f"hand: mirrored in {'xyz'[axis]}", mirrored
-    yield "hand: other side", replace(file, side=other_side)
+    yield "hand: other side", replace(file, side=file.other_side)
     mirror = np.diag([-1.0, 1.0, 1.0])
     flipped = Rotation.from_matrix(mirror @ file.turn.as_matrix() @ mirror)
     left_handed = moved(file, matrix(mirror))
@@ -196,24 +210,17 @@ def tracking_files(file):
     moving = np.flatnonzero(away & np.isfinite(points).all(axis=(1, 2)))
     middle = int(moving[len(moving) // 2])
     for value in (0.0, -1.0, 999.0):
-        absent = np.where(np.isnan(points), value, points)
-        absent[:3] = value
+        absent = with_rows(np.where(np.isnan(points), value, points), slice(3), value)
         yield f"absent: hand is {value:g}", replace(file, points=absent)
-    one = points.copy()
-    one[middle : middle + 4, 7] = 0.0
+    one = with_rows(points, np.s_[middle : middle + 4, 7], 0.0)
     yield "absent: one keypoint is 0", replace(file, points=one)
     for value in (0.0, -1.0):
-        pos = file.pos.copy()
-        pos[middle : middle + 3] = value
+        pos = with_rows(file.pos, slice(middle, middle + 3), value)
         yield f"absent: object is at {value:g}", replace(file, pos=pos)
-    jump = points.copy()
-    jump[middle] += [0.3, 0.0, 0.0]
-    yield "jump: hand by 30 cm", replace(file, points=jump)
-    jump = points.copy()
-    jump[middle] += [0.0, 0.1, 0.0]
-    yield "jump: hand by 10 cm", replace(file, points=jump)
-    pos = file.pos.copy()
-    pos[middle] += [0.3, 0.0, 0.0]
+    for way, jump in (("30 cm", [0.3, 0.0, 0.0]), ("10 cm", [0.0, 0.1, 0.0])):
+        jumped = with_rows(points, middle, points[middle] + jump)
+        yield f"jump: hand by {way}", replace(file, points=jumped)
+    pos = with_rows(file.pos, middle, file.pos[middle] + [0.3, 0.0, 0.0])
     yield "jump: object by 30 cm", replace(file, pos=pos)
     half_turn = np.zeros((len(pos), 3))
     half_turn[middle, 2] = np.pi
@@ -221,22 +228,16 @@ def tracking_files(file):
         "jump: object turns by 180 degrees",
         replace(file, turn=Rotation.from_rotvec(half_turn) * file.turn),
     )
-    frozen = points.copy()
-    count = max(2, round(0.6 * file.fps))
     first = int(moving[0])
-    frozen[first : first + count] = points[first]
-    yield "frozen: hand", replace(file, points=frozen)
-    still = points.copy()
-    still[:] = points[middle]
+    held = slice(first, first + max(2, round(0.6 * file.fps)))
+    yield "frozen: hand", replace(file, points=with_rows(points, held, points[first]))
+    still = np.broadcast_to(points[middle], points.shape)
     yield "frozen: hand all the time", replace(file, points=still)
     standing = np.broadcast_to(file.pos[0], file.pos.shape)
     first_turn = Rotation.from_quat(np.tile(file.turn[0].as_quat(), (len(pos), 1)))
     yield "frozen: object all the time", replace(file, pos=standing, turn=first_turn)
-    lost = file.pos.copy()
-    lost[first : first + count] = file.pos[first]
-    yield "frozen: object", replace(file, pos=lost)
-    turns = np.arange(len(pos))
-    turns[first : first + count] = first
+    yield "frozen: object", replace(file, pos=with_rows(file.pos, held, file.pos[first]))
+    turns = with_rows(np.arange(len(pos)), held, first)
     yield "frozen: orientation of the object", replace(file, turn=file.turn[turns])
     rng = np.random.default_rng(1)
     noise = rng.normal(0.0, 0.01, pos.shape)
@@ -244,19 +245,12 @@ def tracking_files(file):
     tremor = Rotation.from_rotvec(rng.normal(0.0, np.radians(8.0), pos.shape))
     yield "object: trembles by 8 degrees", replace(file, turn=tremor * file.turn)
     twice = np.repeat(np.arange(len(pos)), 2)
-    yield (
-        "copies: every frame twice",
-        replace(
-            file, points=points[twice], pos=file.pos[twice], turn=file.turn[twice], fps=2 * file.fps
-        ),
-    )
-    twice = twice[: len(pos)]
+    yield "copies: every frame twice", file.of(twice, fps=2 * file.fps)
     held = np.arange(len(pos)) // 3 * 3
     yield "copies: hand at a third of the rate", replace(file, points=points[held])
     slow = replace(file, pos=file.pos[held], turn=file.turn[held])
     yield "copies: object at a third of the rate", slow
-    unseen = points.copy()
-    unseen[moving[0] - 2 :] = np.nan
+    unseen = with_rows(points, slice(first - 2, None), np.nan)
     yield "absent: hand while the object moves", replace(file, points=unseen)
 
 
@@ -302,27 +296,18 @@ def time_files(file):
         delayed = np.full_like(points, np.nan)
         delayed[inside] = points[late[inside]]
         yield f"time: hand {1e3 * seconds:g} ms late", replace(file, points=delayed)
-    backwards = slice(None, None, -1)
-    whole = replace(file, pos=file.pos[backwards], turn=file.turn[backwards])
-    yield "time: hand backwards", replace(file, points=points[backwards])
-    yield "time: object backwards", whole
-    yield "time: all backwards", replace(whole, points=points[backwards])
+    whole = file.of(slice(None, None, -1))
+    yield "time: hand backwards", replace(file, points=whole.points)
+    yield "time: object backwards", replace(whole, points=points)
+    yield "time: all backwards", whole
     half = np.minimum(frames // 2, len(points) - 1)
     yield "time: hand at half speed", replace(file, points=points[half])
     for factor in (5.0, 0.2):
         yield f"time: rate times {factor:g}", replace(file, fps=factor * file.fps)
     away = np.linalg.norm(file.pos - file.pos[0], axis=1)
     lifted = int(np.argmax(away > 0.08))
-    starts = slice(lifted, None)
-    yield (
-        "time: begins in the air",
-        replace(file, points=points[starts], pos=file.pos[starts], turn=file.turn[starts]),
-    )
-    rests = slice(0, int(np.argmax(away > 0.005)))
-    yield (
-        "time: ends before the lift",
-        replace(file, points=points[rests], pos=file.pos[rests], turn=file.turn[rests]),
-    )
+    yield "time: begins in the air", file.of(slice(lifted, None))
+    yield "time: ends before the lift", file.of(slice(int(np.argmax(away > 0.005))))
 
 
 def wrong_files(demos, obj):

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from xreset.backends.conformance.harness import SETTLE, Bench, Worlds
 from xreset.backends.conformance.results import Measured, Skipped
+from xreset.backends.conformance.robot_checks import with_drives
 from xreset.backends.conformance.scene import flat_objects, presser
 from xreset.errors import CapabilityError
 from xreset.physics import State
@@ -147,10 +148,9 @@ def joint_friction(bench: Bench) -> Measured:
     loss = 4.0
     robot = presser()
     index = robot.joint_names.index("slide")
-    joint = robot.joints[index]
-    joints = list(robot.joints)
-    joints[index] = replace(joint, drive=replace(joint.drive, friction_loss=loss))
-    scene = _scene(bench, replace(robot, joints=tuple(joints)))
+    friction_loss = np.zeros(len(robot.joints))
+    friction_loss[index] = loss
+    scene = with_drives(_scene(bench, robot), friction_loss=friction_loss)
     steps = torch.tensor([0.02, -0.02, 0.003, -0.003])
     object_index = [0] * len(steps)
     start = _on(scene, ["table"] * len(steps), depth=-0.02)
@@ -161,13 +161,12 @@ def joint_friction(bench: Bench) -> Measured:
             path = worlds.path(start, [target] * 40, 4)[..., index].double().numpy()
     except CapabilityError as error:
         raise Skipped(str(error)) from error
-    kp = joint.drive.kp
-    kd = joint.drive.kd
+    drive = robot.joints[index].drive
     mass = 2.0  # kg, of slider and foot
     times = 4 * scene.timestep * np.arange(1, 41)
 
     def motion(_, y: np.ndarray) -> list[float]:
-        force = kp * (0.02 - y[0]) - kd * y[1] - loss
+        force = drive.kp * (0.02 - y[0]) - drive.kd * y[1] - loss
         return [y[1], force / mass if y[1] > 0 or force > 0 else 0.0]
 
     way = solve_ivp(motion, (0.0, times[-1]), [0.0, 0.0], t_eval=times, max_step=1e-3).y[0]

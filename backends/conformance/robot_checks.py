@@ -72,7 +72,7 @@ def effort_limit(bench: Bench) -> Measured:
     scene = bench.free_scene
     _, way = _each_joint_alone(bench)
     asked = 0.3 * drive_values(scene.robot, "kp") * way.abs().numpy()
-    weak = _with_drives(scene, effort=np.minimum(drive_values(scene.robot, "effort"), asked))
+    weak = with_drives(scene, effort=np.minimum(drive_values(scene.robot, "effort"), asked))
     step = torch.ones(round(_DURATION / scene.control_dt))
     return _against_reference(bench, weak, {"weak step": step})
 
@@ -133,20 +133,20 @@ def drive_equation(bench: Bench) -> Measured:
         stiffer[name] = factor * drive_values(scene.robot, name)
     steps = torch.tensor([0.01, -0.01, 0.08, -0.08])
     errors = {}
-    for what, with_drives in (
+    for what, driven in (
         ("", scene),
-        (", stiffer and weaker", _with_drives(scene, **stiffer)),
+        (", stiffer and weaker", with_drives(scene, **stiffer)),
     ):
         start = bench.start()
         target = start.joint_pos.clone()
         target[:, index] += steps
-        with bench.other(with_drives, bench.object_index) as worlds:
+        with bench.other(driven, bench.object_index) as worlds:
             found = worlds.path(start, [target] * 24, 4)[..., index]
-        joint = with_drives.robot.joints[index]
+        joint = driven.robot.joints[index]
         times = 4 * scene.timestep * np.arange(1, 25)
         for i, step in enumerate(steps.tolist()):
             way = found[:, i].double().numpy() - joint.home
-            exact = _drive_path(with_drives.robot, joint.drive, step, times)
+            exact = _drive_path(driven.robot, joint.drive, step, times)
             errors[f"step of {step:+.2f} m{what}"] = (way - exact) / step
     return errors
 
@@ -187,7 +187,7 @@ def drive_scale(bench: Bench) -> Measured:
         drives = {}
         for name, factor in zip(("kp", "kd", "effort"), factors, strict=True):
             drives[name] = factor * drive_values(scene.robot, name)
-        with bench.other(_with_drives(scene, **drives)) as worlds:
+        with bench.other(with_drives(scene, **drives)) as worlds:
             expected.append(path(worlds, slice(i, i + 1)))
     with bench.other(scene, object_index) as worlds:
         # What was set before must not matter.
@@ -197,7 +197,7 @@ def drive_scale(bench: Bench) -> Measured:
     return named(scene.robot.joint_names, {"path": off}, dim=-1)
 
 
-def _with_drives(scene: SceneSpec, **values: np.ndarray) -> SceneSpec:
+def with_drives(scene: SceneSpec, **values: np.ndarray) -> SceneSpec:
     """Return the scene with other values [J] of its robot's drives."""
     joints = []
     for i, joint in enumerate(scene.robot.joints):

@@ -180,8 +180,7 @@ class NewtonBackend(BatchBackend):
             for values in joints.couplings
         )
         self._couplings = matrix, offset
-        nominal = torch.as_tensor(joints.nominal, dtype=torch.float32, device=self.device)
-        self._drives = nominal
+        self._drives = torch.as_tensor(joints.nominal, dtype=torch.float32, device=self.device)
         self._target = self._per_world(self._control.joint_target_q)
 
     def _captured(self, timestep: float, internal_steps: int) -> wp.Graph:

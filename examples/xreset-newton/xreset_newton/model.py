@@ -103,9 +103,7 @@ def build_model(
             "Newton has no dry friction of joints on the CPU: give the robot's drives a friction_loss of 0."
         )
     kinds = {i: _World(scene, robot, scene.objects[i], settings) for i in set(object_index)}
-    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
-    newton.solvers.SolverSteel.register_custom_attributes(builder)
-    builder.balance_inertia = False
+    builder = _builder()
     pairs = []
     surfaces: list[Surface] = []
     worlds: list[int] = []
@@ -122,15 +120,21 @@ def build_model(
     )
 
 
+def _builder() -> newton.ModelBuilder:
+    """Return a builder without gravity that takes inertias as they are."""
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    newton.solvers.SolverSteel.register_custom_attributes(builder)
+    builder.balance_inertia = False
+    return builder
+
+
 class _World:
     """One world with one object, as a builder."""
 
     def __init__(
         self, scene: SceneSpec, robot: Mechanism, obj: ObjectSpec, settings: NewtonSettings
     ) -> None:
-        self.builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
-        newton.solvers.SolverSteel.register_custom_attributes(self.builder)
-        self.builder.balance_inertia = False
+        self.builder = _builder()
         self.surfaces: list[Surface] = []
         self._config = newton.ModelBuilder.ShapeConfig(
             density=0.0, mu=0.0, gap=settings.contact_gap

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import torch
 from bench_env import motion
-from benchlib import OBJECT, Options, engines, rate
+from benchlib import OBJECT, Options, engines, env_rate, rate
 from rich.console import Console
 from rich.table import Table
 
@@ -64,13 +64,7 @@ def run(options: Options, console: Console) -> None:
                 with make_env(
                     robot, objects, bank, variant, engine=name, num_envs=worlds, device=device
                 ) as env:
-                    action = torch.zeros(worlds, env.num_actions, device=env.device)
-                    steps.append(
-                        worlds
-                        * rate(
-                            lambda env=env, action=action: env.step(action), options.seconds, device
-                        )
-                    )
+                    steps.append(env_rate(env, options.seconds))
             cells = [f"{value:,.0f}" for value in (rays, images, *steps)]
             table.add_row(name, device, *cells, f"{1 - steps[1] / steps[0]:.0%}")
     console.print(table)

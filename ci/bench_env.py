@@ -9,17 +9,19 @@ from __future__ import annotations
 import tempfile
 from pathlib import Path
 
-import torch
-from benchlib import OBJECT, Options, engines, rate
+from benchlib import OBJECT, Options, engines, env_rate, rate
 from rich.console import Console
 from rich.table import Table
 
 from xreset import robots
+from xreset.demos.archive import write_demos
+from xreset.demos.verbs import synthesize
 from xreset.env.manipulation import ManipulationEnv, make_scene
 from xreset.objects.catalogue import load_objects
 from xreset.physics.plugins import make_backend
 from xreset.resets.bank import ResetBank
 from xreset.resets.distribution import ResetDistribution
+from xreset.resets.inputs import load_inputs
 from xreset.spec import RobotSpec
 from xreset.task.config import TaskConfig
 
@@ -42,11 +44,7 @@ def run(options: Options, console: Console) -> None:
                     task,
                     ResetDistribution(bank, robot, bank.object_names, task.reset, backend.device),
                 )
-                action = torch.zeros(options.num_envs, env.num_actions, device=backend.device)
-                stepped = (
-                    rate(lambda env=env, action=action: env.step(action), options.seconds, device)
-                    * options.num_envs
-                )
+                stepped = env_rate(env, options.seconds)
                 table.add_row(
                     name, device, f"{wrapped:,.0f}", f"{stepped:,.0f} ({stepped / wrapped:.2f})"
                 )
@@ -55,10 +53,6 @@ def run(options: Options, console: Console) -> None:
 
 def motion(robot: RobotSpec, folder: Path) -> ResetBank:
     """Starts and goals of one synthetic demonstration."""
-    from xreset.demos.archive import write_demos
-    from xreset.demos.verbs import synthesize
-    from xreset.resets.inputs import load_inputs
-
     file = folder / "demos.npz"
     write_demos(file, synthesize([OBJECT], 1, seed=0))
     return load_inputs(file, robot=robot).bank

@@ -18,12 +18,11 @@ import mujoco_warp as mjw
 import numpy as np
 import torch
 import warp as wp
-from benchlib import Options, seconds_of
+from benchlib import Options, seconds_of, trained_env
 from rich.console import Console
 from rich.table import Table
 
 from xreset.backends import mujoco_warp_step
-from xreset.env.manipulation import make_env
 from xreset.learning.config import TrainConfig
 from xreset.resets.inputs import load_inputs
 
@@ -48,15 +47,7 @@ def run(options: Options, console: Console) -> None:
     inputs = load_inputs(extra["resets"], robot=options.robot, meshes=extra["meshes"])  # pyright: ignore[reportArgumentType]
     task = TrainConfig().task
     task = replace(task, reset=replace(task.reset, demo_probability=1.0))
-    with make_env(
-        inputs.robot,
-        inputs.objects,
-        inputs.bank,
-        task,
-        engine="mujoco-warp",
-        num_envs=options.num_envs,
-        device=options.device,
-    ) as env:
+    with trained_env(inputs, task, options) as env:
         generator = torch.Generator(env.device).manual_seed(0)
         for _ in range(_PLAYED):
             shape = (env.num_envs, env.num_actions)

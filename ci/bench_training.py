@@ -22,11 +22,11 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from benchlib import OBJECT, Options, rate, run_time, seconds_of
+from benchlib import OBJECT, Options, rate, run_time, seconds_of, trained_env
 from rich.console import Console
 from rich.table import Table
 
-from xreset.env.manipulation import ManipulationEnv, make_env
+from xreset.env.manipulation import ManipulationEnv
 from xreset.learning.config import TrainConfig
 from xreset.learning.recipes import starting_config
 from xreset.learning.runner import TrainingRunner
@@ -56,15 +56,7 @@ def run(options: Options, console: Console) -> None:
         inputs = load_inputs(resets, robot=options.robot, meshes=options.extra["meshes"])
         config = starting_config(options.extra["recipe"])
         config = replace(config, ppo=replace(config.ppo, precision=options.extra["precision"]))
-        with make_env(
-            inputs.robot,
-            inputs.objects,
-            inputs.bank,
-            config.task,
-            engine="mujoco-warp",
-            num_envs=options.num_envs,
-            device=options.device,
-        ) as env:
+        with trained_env(inputs, config.task, options) as env:
             console.print(_measure(env, config, options, Path(folder)))
 
 

@@ -12,9 +12,16 @@ import torch
 from rich.console import Console
 from rich.markup import escape
 
+from xreset.demos.archive import rest_on_table
+from xreset.demos.verbs import synthesize
+from xreset.env.manipulation import ManipulationEnv, make_env
+from xreset.geometry.kinematics import Kinematics
 from xreset.physics import State
 from xreset.physics.plugins import backend_names, backend_status
+from xreset.resets.inputs import Inputs
+from xreset.retarget.verbs import retarget_demos
 from xreset.spec import ObjectSpec, RobotSpec
+from xreset.task.config import TaskConfig
 
 OBJECT = "005_tomato_soup_can"
 
@@ -71,6 +78,25 @@ def rate(step: Callable[[], object], seconds: float, device: str) -> float:
     return 5 / float(np.median(bursts))
 
 
+def env_rate(env: ManipulationEnv, seconds: float) -> float:
+    """Control steps of all worlds per second, with actions at zero."""
+    action = torch.zeros(env.num_envs, env.num_actions, device=env.device)
+    return env.num_envs * rate(lambda: env.step(action), seconds, env.device.type)
+
+
+def trained_env(inputs: Inputs, task: TaskConfig, options: Options) -> ManipulationEnv:
+    """The worlds of a training on mujoco-warp."""
+    return make_env(
+        inputs.robot,
+        inputs.objects,
+        inputs.bank,
+        task,
+        engine="mujoco-warp",
+        num_envs=options.num_envs,
+        device=options.device,
+    )
+
+
 def run_time(command: Sequence[str]) -> float:
     """Wall time of a command [s]."""
     return seconds_of(lambda: subprocess.run(command, check=True, stdout=subprocess.DEVNULL))
@@ -81,11 +107,6 @@ def held_grasp(robot: RobotSpec, objects: Sequence[ObjectSpec]) -> State:
 
     A retargeted synthetic demonstration gives the hand's shape. With the drives' targets each fingertip presses towards the object's centre.
     """
-    from xreset.demos.archive import rest_on_table
-    from xreset.demos.verbs import synthesize
-    from xreset.geometry.kinematics import Kinematics
-    from xreset.retarget.verbs import retarget_demos
-
     moved = retarget_demos(
         rest_on_table(synthesize([objects[0].name], 1, seed=0), objects), robot, objects
     )

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import random
+import shlex
 import shutil
 import signal
 import subprocess
@@ -20,16 +21,10 @@ XRESET = [sys.executable, "-m", "xreset"]
 LEFTOVERS = (".part", ".lock", ".partial")
 SHARED_MEMORY = Path("/dev/shm")
 
-SMALL = [
-    "--config.save-interval",
-    2,
-    "--config.task.observation.cloud-points",
-    16,
-    "--config.model.lstm",
-    16,
-]
-SMALL += ["--config.model.mlp", 16, "--config.model.pointnet", 8, 8, "--config.ppo.horizon", 8]
-SMALL += ["--config.ppo.minibatch-size", 64]
+SMALL = (
+    "--config.save-interval 2 --config.task.observation.cloud-points 16 --config.model.lstm 16 --config.model.mlp 16"
+    " --config.model.pointnet 8 8 --config.ppo.horizon 8 --config.ppo.minibatch-size 64"
+)
 
 
 @dataclass(frozen=True)
@@ -37,7 +32,8 @@ class Command:
     """A command that is killed."""
 
     name: str
-    arguments: list
+    arguments: str
+    """As they are typed after ``xreset``."""
     result: Path
     """A file that exists when the command has ended."""
     checkpoints: Path | None = None
@@ -57,123 +53,76 @@ def commands(folder: Path) -> list[Command]:
     bank = folder / "bank.npz"
     run = folder / "run"
     eyes = folder / "eyes"
-    studies = folder / "studies"
-    where = ["--engine", "mujoco", "--device", "cpu", "--num-envs", 4]
-    resume = ["train", "--out", run]
-    robot = ["--arm", "tests/robots/arm.urdf", "--hand", "tests/robots/hand.xml"]
-    watch = [
-        "--out",
-        eyes,
-        "--resets",
-        bank,
-        "--iterations",
-        60,
-        "--config.task.vision.width",
-        8,
-        "--config.task.vision.height",
-        8,
-        "--config.task.vision.points",
-        16,
-    ]
+    where = "--engine mujoco --device cpu --num-envs 4"
+    watch = (
+        "--config.task.vision.width 8 --config.task.vision.height 8 --config.task.vision.points 16"
+    )
+    robot = "--arm tests/robots/arm.urdf --hand tests/robots/hand.xml"
+    training = {"result": run / "policy.onnx", "checkpoints": run / "checkpoints"}
     return [
-        Command(
-            "demos synth",
-            ["demos", "synth", "--out", demos, "--objects", "soup", "--per-object", 2],
-            demos,
-        ),
-        Command("retarget", ["retarget", demos, "--robot", "openarm", "--out", motion], motion),
-        Command("resets", ["resets", motion, "--out", bank], bank),
+        Command("demos synth", f"demos synth --out {demos} --objects soup --per-object 2", demos),
+        Command("retarget", f"retarget {demos} --robot openarm --out {motion}", motion),
+        Command("resets", f"resets {motion} --out {bank}", bank),
         Command(
             "train",
-            [
-                "train",
-                "--out",
-                run,
-                "--robot",
-                "openarm",
-                "--resets",
-                bank,
-                *where,
-                "--iterations",
-                60,
-                *SMALL,
-            ],
-            run / "policy.onnx",
-            run / "checkpoints",
+            f"train --out {run} --robot openarm --resets {bank} {where} --iterations 60 {SMALL}",
+            **training,
         ),
-        Command(
-            "train, to continue",
-            [*resume, "--iterations", 120],
-            run / "policy.onnx",
-            run / "checkpoints",
-        ),
-        Command(
-            "eval", ["eval", run, "--demos", demos, "--episodes", 4], run / "eval" / "mujoco.json"
-        ),
+        Command("train, to continue", f"train --out {run} --iterations 120", **training),
+        Command("eval", f"eval {run} --demos {demos} --episodes 4", run / "eval/mujoco.json"),
         Command(
             "stress",
-            ["stress", run, "--demos", demos, "--engine", "mujoco", "--property", "object-mass"],
-            run / "stress" / "mujoco.json",
+            f"stress {run} --demos {demos} --engine mujoco --property object-mass",
+            run / "stress/mujoco.json",
         ),
         Command(
             "stress --faults",
-            [
-                "stress",
-                run,
-                "--demos",
-                demos,
-                "--property",
-                "pose-delay",
-                "--property",
-                "lost-frames",
-            ],
-            run / "faults" / "mujoco.json",
+            f"stress {run} --demos {demos} --property pose-delay --property lost-frames",
+            run / "faults/mujoco.json",
         ),
         Command(
             "distill",
-            ["train", "--teacher", run, *watch, *where],
+            f"train --teacher {run} --out {eyes} --resets {bank} --iterations 60 {watch} {where}",
             eyes / "policy.onnx",
             eyes / "checkpoints",
         ),
-        Command("report", ["report", run], run / "report" / "index.html"),
+        Command("report", f"report {run}", run / "report/index.html"),
         Command(
             "export deploy",
-            ["export", "deploy", run, "--out", folder / "deploy"],
-            folder / "deploy" / "leapp.yaml",
+            f"export deploy {run} --out {folder}/deploy",
+            folder / "deploy/leapp.yaml",
             once=True,
         ),
         Command(
             "export episodes",
-            ["export", "episodes", run, "--out", folder / "episodes.npz"],
+            f"export episodes {run} --out {folder}/episodes.npz",
             folder / "episodes.npz",
         ),
         Command(
             "demos select",
-            ["demos", "select", demos, "--per-object", 1, "--out", folder / "one.npz"],
+            f"demos select {demos} --per-object 1 --out {folder}/one.npz",
             folder / "one.npz",
         ),
         Command(
-            "goals",
-            ["goals", "soup", "--robot", "openarm", "--out", folder / "goals.npz"],
-            folder / "goals.npz",
+            "goals", f"goals soup --robot openarm --out {folder}/goals.npz", folder / "goals.npz"
         ),
         Command(
             "objects make",
-            ["objects", "make", "--out", folder / "shapes", "--count", 8],
+            f"objects make --out {folder}/shapes --count 8",
             folder / "shapes",
             once=True,
         ),
         Command(
             "robots import",
-            ["robots", "import", *robot, "--out", folder / "robot"],
-            folder / "robot" / "robot.toml",
+            f"robots import {robot} --out {folder}/robot",
+            folder / "robot/robot.toml",
             once=True,
         ),
-        Command("view", ["view", motion, "--out", folder / "a.png"], folder / "a.png"),
+        Command("view", f"view {motion} --out {folder}/a.png", folder / "a.png"),
         Command(
             "study",
-            ["study", "seconds", "--out", studies],
-            studies / "reports" / "seconds" / "index.html",
+            f"study seconds --out {folder}/studies",
+            folder / "studies/reports/seconds/index.html",
         ),
     ]
 
@@ -246,9 +195,9 @@ def remove_if_once(command: Command) -> None:
         shutil.rmtree(result if result.is_dir() else result.parent)
 
 
-def attempt(arguments: list, delay: float | None) -> int | None:
+def attempt(arguments: str, delay: float | None) -> int | None:
     """Return the exit status, or None if the command was killed after ``delay`` seconds. An error is shown."""
-    line = [*XRESET, *map(str, arguments)]
+    line = [*XRESET, *shlex.split(arguments)]
     process = subprocess.Popen(
         line, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True, text=True
     )
@@ -260,7 +209,7 @@ def attempt(arguments: list, delay: float | None) -> int | None:
         time.sleep(0.3)  # workers notice that their input has ended
         return None
     if process.returncode:
-        print(f"xreset {' '.join(line[3:])}\n{said}")
+        print(f"xreset {arguments}\n{said}")
     return process.returncode
 
 

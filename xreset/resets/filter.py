@@ -20,7 +20,7 @@ from xreset.geometry.collision import object_depth
 from xreset.physics import State
 from xreset.resets.bank import ResetBank, starts_and_goals
 from xreset.resets.closing import closing_states
-from xreset.resets.config import ClosingConfig, FilterConfig, SqueezeConfig
+from xreset.resets.config import ClosingConfig, FilterConfig
 from xreset.resets.fingers import fingers_of, grip_forces, squeeze_targets
 from xreset.resets.probe import REASONS, rejection, rejections
 from xreset.retarget.file import Retargeted
@@ -44,12 +44,15 @@ def stable_states(
     *,
     limits: FilterConfig,
     closing: ClosingConfig,
-    squeeze: SqueezeConfig,
+    force: float,
     num_envs: int,
     device: str,
     progress: Progress,
 ) -> ResetBank:
-    """Return the bank of the states that all engines accept; see :func:`xreset.resets.verbs.make_bank`."""
+    """Return the bank of the states that all engines accept; see :func:`xreset.resets.verbs.make_bank`.
+
+    ``force``: normal force of each finger that presses [N]; 0: none does.
+    """
     owner = retargeted.sequence_of_frame
     used = objects_named(objects, retargeted.object_name[owner[retargeted.valid]])
     if not retargeted.valid.any():
@@ -77,11 +80,11 @@ def stable_states(
     shallow = np.flatnonzero(depth <= Thresholds().object_depth)
     reason = np.full(len(frame), REASONS.index("object collision"))
     reason[shallow] = find(object_name[shallow], states[shallow], progress=progress)
-    if squeeze.presses:
+    if force:
         rows = np.flatnonzero((reason < 0) & post_contact)
         touching = [values[rows] for values in poses]
         fingers = fingers_of(robot, scene.objects, object_name[rows], *touching)
-        forces = grip_forces(fingers, squeeze.newtons(len(robot.fingertips)))
+        forces = grip_forces(fingers, force)
         beyond = squeeze_targets(robot, fingers, touching[0], forces) - touching[0]
         push = torch.zeros_like(states.joint_pos)
         push[rows] = torch.as_tensor(beyond, dtype=push.dtype)
@@ -107,7 +110,7 @@ def stable_states(
         starts_and_goals(retargeted, robot, objects),
         engines=engines,
         joint_pos=stable.joint_pos.numpy(),
-        joint_target=stable.joint_target.numpy() if squeeze.presses else None,
+        joint_target=stable.joint_target.numpy() if force else None,
         object_pos=stable.object_pos.numpy(),
         object_quat_wxyz=stable.object_quat.numpy(),
         object_name=object_name[keep],

@@ -306,7 +306,7 @@ def _resting_poses(
         first_alike = (ups @ ups.T > _SAME_POSE).argmax(axis=1)
         poses, which = np.unique(first_alike, return_inverse=True)
         rows[obj.name] = len(names) + which
-        for quat in quat_of(turns[poses]):
+        for quat in quat_of(turns)[poses]:
             names.append(obj.name)
             starts.append((*_MIDDLE, rest_height(obj, quat)))
             quats.append(quat)

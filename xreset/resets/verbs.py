@@ -100,7 +100,7 @@ def make_bank(
     limits = limits or FilterConfig()
     closing = closing or ClosingConfig(spacing=None)
     squeeze = squeeze or SqueezeConfig(force=0.0)
-    squeeze = SqueezeConfig(force=squeeze.newtons(len(inputs.robot.fingertips)))
+    force = squeeze.newtons(len(inputs.robot.fingertips))
     transfer = transfer or TransferConfig(per_pose=0)
     bank = stable_states(
         motion,
@@ -108,7 +108,7 @@ def make_bank(
         engines,
         limits=limits,
         closing=closing,
-        squeeze=squeeze,
+        force=force,
         num_envs=num_envs,
         device=device,
         progress=partial(progress, f"states stable in {', '.join(engines)}"),
@@ -129,7 +129,7 @@ def make_bank(
             "num_envs": num_envs,
             "filter": asdict(limits),
             "closing": asdict(closing),
-            "squeeze": asdict(squeeze),
+            "squeeze": {"force": force},
             "transfer": asdict(transfer),
             "robot": inputs.robot_name,
             "meshes": str(inputs.meshes) if inputs.meshes else None,

@@ -1,10 +1,12 @@
 """`xreset run`: the commands that it gives, and what it leaves out when it is given again."""
 
+import shutil
 from unittest import TestCase
 from unittest.mock import patch
 
 import xreset
 from tests.command import refused
+from tests.command import xreset as xreset_command
 from tests.toy_results import InFolder
 from xreset.cli import perform
 from xreset.cli import run as command
@@ -12,6 +14,7 @@ from xreset.demos.archive import write_demos
 from xreset.demos.verbs import synthesize
 from xreset.errors import FileFormatError, RunError
 from xreset.files.storage import file_hash
+from xreset.physics.plugins import robot_folder
 from xreset.retarget.file import read_retargeted, write_retargeted
 
 
@@ -51,6 +54,26 @@ class Run(InFolder, TestCase):
         write_retargeted(motion, read_retargeted(motion))  # states no inputs
         with self.assertRaisesRegex(RunError, "motion.npz was made with another archive"):
             self.run_it()
+
+    def test_times_are_of_the_robot_and_the_engines_that_were_measured(self):
+        told = " ".join(command._times(1200, 900.0, ["mujoco", "pybullet", "drake"], 25.0))
+        for words in (
+            "retarget 0.5, resets 0.76, eval in mujoco 1.4, eval in pybullet 9. This machine has",
+            "The time of eval in drake is not known.",
+            "train takes 25 minutes, and compiles kernels first.",
+        ):
+            self.assertIn(words, told)
+        self.assertNotIn("is not known", " ".join(command._times(60, 9.0, ["sapien"], 1.0)))
+        self.assertIn("ends after its iterations", [*command._times(60, 9.0, [], None)][-1])
+        demos = self.folder / "soup.npz"
+        write_demos(demos, synthesize(["soup"], 1, fps=5))
+        own = self.folder / "mine"
+        shutil.copytree(robot_folder("openarm"), own)
+        for robot, is_known in (("openarm", True), (own, False)):
+            with patch.object(command, "_step", side_effect=KeyboardInterrupt):
+                words = ("run", demos, "--engine mujoco --robot", robot, "--out", self.folder / "a")
+                said = xreset_command(*words)[1]
+            self.assertEqual("of another robot are not known" not in said, is_known, said)
 
     def test_nothing_is_made_if_a_later_step_would_refuse(self):
         demos = self.folder / "soup.npz"

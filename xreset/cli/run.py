@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import shlex
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from xreset.cli import perform
@@ -17,15 +17,17 @@ from xreset.files.records import stated_inputs
 from xreset.files.storage import claim_folder, file_hash
 from xreset.files.text import quantity
 from xreset.learning.run import read_run
-from xreset.physics.plugins import Device, backend_class
+from xreset.physics.plugins import Device, backend_class, robot_names
 
 _MINUTES = 25.0
 """Length of the training where nothing else is said."""
 _RETARGET = 0.025
-_RESETS = 0.055
-_EPISODE = 1.0
-"""About how many seconds of one core it takes to retarget a frame, to make the bank's states of a frame, and to play an
-episode of 5 s in one engine (UR7e + Sharpa, nine YCB objects)."""
+_RESETS = 0.038
+"""Seconds of one core to retarget a frame, and to make the bank's states of a frame: the longest of the six robots that
+ship, whose times are 0.017 to 0.025 and 0.021 to 0.038 (nine YCB objects, 1,310 frames)."""
+_EPISODE = {"mujoco": 0.09, "sapien": 0.12, "pybullet": 0.6}
+"""Engine -> seconds of one core to play a second of an episode with UR7e + Sharpa, nine YCB objects. The jaw of the
+OpenArm takes about half of them."""
 
 
 @obeys_rules
@@ -88,7 +90,15 @@ def run(
     backend_class(ENGINE).engine_version()
     if minutes is None and iterations is None:
         minutes = _MINUTES
-    _show_times(len(archive.sequence_name), archive.num_frames, minutes, episodes, engines)
+    console.print(
+        f"{quantity(archive.num_sequences, 'demonstration')}, {quantity(archive.num_frames, 'frame')}; engines: "
+        f"{', '.join(engines)}"
+    )
+    played = archive.num_sequences * episodes * task.termination.episode_seconds
+    for line in _times(archive.num_frames, played, engines, minutes):
+        console.print(line)
+    if str(robot) not in robot_names():
+        console.print("These are times of robots that ship; those of another robot are not known.")
     motion = out / "motion.npz"
     bank = out / "resets.npz"
     _refuse_other_training(out, bank)
@@ -124,25 +134,31 @@ def run(
     _step("report", out, meshes=meshes)
 
 
-def _show_times(
-    sequences: int, frames: int, minutes: float | None, episodes: int, engines: list[str]
-) -> None:
-    """Print about how long each step takes on this machine."""
-    cores = os.cpu_count() or 1
-    played = sequences * episodes * len(engines)
-    steps = {
-        "retarget": frames * _RETARGET / 60 / cores,
-        "resets": frames * _RESETS / 60 / min(cores, 2),
-    }
-    if minutes is not None:
-        steps["train"] = minutes
-    steps["eval"] = played * _EPISODE / 60 / cores
-    times = ", ".join(f"{name} {max(value, 0.1):.2g}" for name, value in steps.items())
-    console.print(
-        f"{quantity(sequences, 'demonstration')}, {quantity(frames, 'frame')}, {quantity(cores, 'core')}; "
-        f"engines: {', '.join(engines)}. "
-        f"About how many minutes each step takes: {times}."
-    )
+def _times(
+    frames: int, seconds: float, engines: Sequence[str], minutes: float | None
+) -> Iterator[str]:
+    """Yield sentences about the time of the steps.
+
+    Args:
+        frames: frames of the demonstrations.
+        seconds: time of all episodes in one engine [s].
+        engines: engines of the evaluation.
+        minutes: length of the training; None: it ends after iterations.
+    """
+    steps = {"retarget": frames * _RETARGET, "resets": frames * _RESETS}
+    for name in engines:
+        if name in _EPISODE:
+            steps[f"eval in {name}"] = seconds * _EPISODE[name]
+    cores = quantity(os.cpu_count() or 1, "core")
+    times = ", ".join(f"{name} {max(value / 60, 0.1):.2g}" for name, value in steps.items())
+    yield f"About how many minutes of one core the steps take: {times}. This machine has {cores}."
+    unknown = [name for name in engines if name not in _EPISODE]
+    if unknown:
+        yield f"The time of eval in {', '.join(unknown)} is not known."
+    if minutes is None:
+        yield "The time of train is not known: it ends after its iterations."
+    else:
+        yield f"train takes {minutes:g} minutes, and compiles kernels first."
 
 
 def _refuse_other_training(out: Path, bank: Path) -> None:

@@ -43,7 +43,7 @@ VALUES = (
     "True", "None", "\r\n", "\u202e", "x=1", "x=nan,inf", "cuda:99999999999", "[]", "{}", "a" * 5000, *NUMBERS, *NAMES,
 )  # fmt: skip
 """Values of any option."""
-WRITTEN = ("out", "rest", "png", "mp4", "picture", "json", "film", "page")
+WRITTEN = ("out", "rest", "picture", "film")
 """Options that name a file or folder that a command writes."""
 WAIT_OR_WORK = {"engines check"}
 """Commands that need no file and work for minutes."""

@@ -198,6 +198,8 @@ class UsageTest(TestCase):
         for words, told in (
             ("engines check --backend bulet", ["--backend is now --engine"]),
             ("engines compare none --only mug", ["--only is now --object"]),
+            ("goals --robot none --out g.npz --draw.seed 1", ["--draw.seed is now --seed", "none"]),
+            ("objects import none --png x.png", ["--png is now --picture", "no none"]),
             ("view none --mp4=x.mp4", ["--mp4 is now --out", "none"]),
             ("engines check --engine bulet --page x.md", ["--page is now --out", "bulet"]),
             (
@@ -232,6 +234,7 @@ class UsageTest(TestCase):
             ("eval zero --demos none --settle", "--settle is gone: episodes begin as recorded"),
             ("resets none --out b.npz --squeeze.weight 0", "press with --squeeze.force and the"),
             ("resets none --out b.npz --squeeze.reach=0.1", "--squeeze.reach is gone: fingers"),
+            ("demos synth --out a.npz --fps 10", "synth --fps is gone: demonstrations have 30"),
             ("select runs/soup", "select is gone: evaluate checkpoints"),
             (
                 "engines attribute zero --towards sapien",

@@ -547,7 +547,7 @@ class Commands(InFolder):
 
     def test_synth_then_info(self):
         file = self.folder / "demos.npz"
-        synth = ("demos synth --objects soup --per-object 1 --side both --fps 10 --out", file)
+        synth = ("demos synth --objects soup --per-object 1 --side both --out", file)
         out = succeeds(*synth)
         first = file.read_bytes()
         self.assertEqual(read_demos(file).hand_side.tolist(), ["right", "left"])

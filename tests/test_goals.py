@@ -95,7 +95,7 @@ class MadeTest(InOneFolder):
     def test_the_command_draws_what_its_options_say(self):
         pose = (0.6, 0.25, 0.3, 1, 0, 0, 0)
         file = self.folder / "goals.npz"
-        options = ("--family yaw --draw.per-family 2 --draw.seed 3 --pose", *pose)
+        options = ("--family yaw --per-family 2 --seed 3 --pose", *pose)
         said = succeeds("goals banana --robot ur7e-sharpa --out", file, *options)
         self.assertIn("3 goals of 1 object (2 yaw, 1 own)", said)
         config = GoalConfig(per_family=2, seed=3)

@@ -419,7 +419,7 @@ class MeshImport(InFolder):
         self.assertIn("Add --out", refused(*command))
         self.assertIn("There is no no.stl.", refused("objects import no.stl"))
         self.assertRegex(
-            succeeds(*command, "--out", out, "--name brick --png", png),
+            succeeds(*command, "--out", out, "--name brick --picture", png),
             r"brick\W+0.2\W+100x60x40\W+1 hull",
         )
         self.assertTrue(png.read_bytes().startswith(b"\x89PNG"))

@@ -22,6 +22,11 @@ _RENAMED = {
     "engines compare --json": "--out",
     "engines check --json": "--out",
     "engines check --page": "--out",
+    "objects import --png": "--picture",
+    "--draw.per-family": "--per-family",
+    "--draw.seed": "--seed",
+    "--draw.upright": "--upright",
+    "--draw.no-upright": "--no-upright",
     "view --png": "--out",
     "view --mp4": "--out",
     # names of objects, as always
@@ -42,6 +47,7 @@ _GONE = {
     "select": "evaluate checkpoints, xreset eval RUN/checkpoints/NUMBER.pt, and compare them with xreset report",
     "engines attribute": "xreset engines check measures engines, xreset stress what a policy tolerates",
     "engines trace": "xreset engines compare plays grasps in several engines, xreset report films policies in them",
+    "demos synth --fps": "demonstrations have 30 frames a second; xreset.synthesize in Python takes fps",
     "--apart": "runs that differ only in their seed share a row; xreset report RUN shows one of them",
     "--curve": "the page has success, grasps and return, and TensorBoard shows all curves",
     "--x": "curves are drawn over minutes, and TensorBoard draws them over any axis",
@@ -83,6 +89,7 @@ def with_present_words(argv: list[str]) -> list[str]:
             present = f"--config.task.{flag[2:]}"
         if flag.startswith("--"):
             _refuse_gone(flag)
+            _refuse_gone(f"{command} {flag}")
         if flag in _NEEDLESS:
             print(f"xreset: {flag} is gone: {_NEEDLESS[flag]}.", file=sys.stderr)
         else:

@@ -51,6 +51,8 @@ def verb(
         marks = marks_in(hints[each.name])
         named = [mark.name for mark in marks if isinstance(mark, Option)]
         name = (named or [each.name])[0]
+        if name is None:
+            continue
         each = each.replace(default=defaults.get(each.name, each.default))
         option = _option(each, hints[each.name], is_positional=i == 0 and not named)
         if option is not None:

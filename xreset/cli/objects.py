@@ -40,8 +40,8 @@ def _show_imported(found: Sequence[Import], options: Mapping[str, Any]) -> None:
         for note in (*result.notes, result.hollows()):
             if note:
                 console.print(f"{result.obj.name}: {note}")
-    if options["png"]:
-        console.print(f"{options['png']}: meshes and their pieces")
+    if options["picture"]:
+        console.print(f"{options['picture']}: meshes and their pieces")
 
 
 _HEAD: tuple[str, ...] = ("object", "alias", "kg", "size, mm", "pieces")

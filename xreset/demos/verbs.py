@@ -120,7 +120,7 @@ def synthesize(
     seed: Seed = 0,
     *,
     out: Output | None = None,
-    fps: float = 30.0,
+    fps: Annotated[float, Option(None)] = 30.0,
     side: Literal["right", "left", "both"] = "right",
     meshes: str | Path | None = None,
     progress: Progress = unseen,

@@ -75,9 +75,10 @@ class Written:
 
 @dataclass(frozen=True)
 class Option:
-    """Name of an argument as an option of the command, in its annotation, if it is another."""
+    """Name of an argument as an option of the command, in its annotation, if it is another. None: the command has no
+    such option."""
 
-    name: str
+    name: str | None
 
 
 def _ends_in(*suffixes: str) -> Rule:

@@ -154,7 +154,7 @@ def import_objects(
     scale: float = 1.0,
     mass: float | None = None,
     friction: float | None = None,
-    png: Png | None = None,
+    picture: Png | None = None,
     progress: NamedProgress = unseen,
 ) -> list[Import]:
     """Cut a mesh, or every mesh of a folder, into convex pieces, and keep them for later runs.
@@ -171,7 +171,7 @@ def import_objects(
         scale: length of a unit of the file in metres: 0.001 for millimetres.
         mass: mass in kg.
         friction: friction coefficient: the middle of the range that training and evaluation draw from.
-        png: picture to write: the meshes next to their pieces, with the deviation in millimetres.
+        picture: PNG to write: the meshes next to their pieces, with the deviation in millimetres.
         progress: called with (the mesh that is cut, meshes done, meshes in all).
 
     Raises:
@@ -221,12 +221,12 @@ def import_objects(
                 file, Path(out), object_name, scale=scale, properties=properties
             )
         found.append(result)
-    if png is not None:
+    if picture is not None:
         captions = []
         for result in found:
             deviation = f"at most {1e3 * result.deviation:.1f} mm off the surface"
             count = quantity(len(result.obj.pieces), "piece")
             captions.append(f"{result.obj.name}: {count}, {deviation}")
         objects = [result.obj for result in found]
-        render.write_png(Path(png), pieces.draw_pieces(objects, captions))
+        render.write_png(Path(picture), pieces.draw_pieces(objects, captions))
     return found

@@ -9,6 +9,7 @@ from xreset.files.checks import (
     Length,
     NonNegativeFloat,
     NonNegativeInt,
+    Options,
     PositiveFloat,
     PositiveInt,
     frozen,
@@ -68,7 +69,7 @@ class TransferConfig(Checked):
 
 
 @frozen
-class GoalConfig(Checked):
+class GoalConfig(Checked, Options):
     """How a goal set is drawn (:mod:`xreset.resets.goals`)."""
 
     per_family: PositiveInt = 20

@@ -149,7 +149,7 @@ def make_goals(
     meshes: str | Path | None = None,
     families: Annotated[str | Sequence[str] | None, Option("family")] = None,
     poses: Annotated[Sequence[Pose], Option("pose")] = (),
-    config: Annotated[GoalConfig | None, Option("draw")] = GoalConfig(),
+    config: GoalConfig | None = GoalConfig(),
     progress: Progress = unseen,
 ) -> GoalSet:
     """Give objects starts and goals without demonstrations, for xreset eval --demos and xreset train --goals.

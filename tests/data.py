@@ -1,4 +1,4 @@
-"""Temporary folders, and real demonstrations, which may not be part of the project."""
+"""Temporary folders, upright objects, and real demonstrations, which may not be part of the project."""
 
 import os
 import tempfile
@@ -7,11 +7,24 @@ from importlib.util import find_spec
 from pathlib import Path
 from unittest import SkipTest, TestCase, skipUnless
 
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from xreset import synthesize
+
 DEFAULT = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 PYBULLET = skipUnless(
     find_spec("pybullet"), "PyBullet is not installed: it has wheels for Python 3.11 only"
 )
+
+
+def upright(name, count, **options):
+    """Return synthetic demonstrations of an object that start with its z up, as in the trainings of older policies."""
+    demos = synthesize([name], 5 * count, **options)
+    start = demos.object_quat_wxyz[demos.frame_offsets[:-1]]
+    ups = Rotation.from_quat(start, scalar_first=True).as_matrix()[:, 2, 2]
+    return demos.select(indices=np.flatnonzero(ups > 0.99)[:count])
 
 
 @contextmanager

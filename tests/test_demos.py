@@ -456,6 +456,17 @@ class Synthetic(InFolder):
         for bounds, values in (angles | places).items():
             self.assertTrue(bounds[0] - 1e-5 < values.min() < values.max() < bounds[1] + 1e-5)
 
+    def test_objects_start_at_rest_on_any_side(self):
+        demos = synthesize(["spam"], 12, seed=0, fps=5)
+        first = demos.frame_offsets[:-1]
+        start = demos.object_quat_wxyz[first]
+        ups = Rotation.from_quat(start, scalar_first=True).inv().apply([0.0, 0.0, 1.0])
+        sides = {tuple(side) for side in ups.round()}
+        self.assertIn((0.0, 0.0, 1.0), sides)
+        self.assertGreaterEqual(len(sides), 4)
+        heights = rest_height(load_object("010_potted_meat_can"), start)
+        assert_allclose(demos.object_pos[first, 2], heights, atol=1e-6)
+
     def test_a_wall_of_ones_own_mesh_is_held_from_both_sides(self):
         trimesh.creation.annulus(0.0365, 0.04, 0.09, sections=16).export(self.folder / "tube.obj")
         demos = synthesize(None, per_object=1, seed=0, meshes=self.folder)

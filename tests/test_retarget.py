@@ -13,10 +13,10 @@ from torch import tensor
 from torch.testing import assert_close
 
 from tests.command import refused, succeeds
-from tests.data import InOneFolder, data_dir, refuses
+from tests.data import InOneFolder, data_dir, refuses, upright
 from tests.toy_retarget import FLOAT, arm_targets, box_object, check_gradient, double, hand_targets
 from tests.toy_robot import toy_motion, toy_robot
-from xreset import read_retargeted, robots, synthesize, write_retargeted
+from xreset import read_retargeted, robots, write_retargeted
 from xreset.demos.archive import demo_objects, read_demos, rest_on_table, write_demos
 from xreset.errors import DemoError, FileFormatError, RobotError, XResetError
 from xreset.files.records import arrays_of, stated_doubts, write_npz
@@ -352,7 +352,7 @@ class PipelineTest(InOneFolder):
     def setUpClass(cls):
         super().setUpClass()
         cls.robot = robots.load("ur7e-sharpa")
-        demos = synthesize(["soup"], per_object=2, seed=0, fps=20)
+        demos = upright("soup", 2, seed=0, fps=20)
         valid = demos.hand_valid.copy()
         valid[demos.frames(1)] = False  # a sequence in which the hand was never seen
         valid[0] = False

@@ -10,10 +10,11 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from tests import toy_grasp
 from tests.command import succeeds, xreset
-from tests.data import InFolder
+from tests.data import InFolder, upright
 from tests.toy_bank import SOUP
 from tests.toy_results import swept
-from xreset import stress, synthesize
+from xreset import stress
+from xreset.demos.archive import write_demos
 from xreset.errors import PolicyError
 from xreset.eval.conditions import FAULTS
 from xreset.eval.effects import verdict
@@ -156,7 +157,7 @@ class VerdictTest(TestCase):
 class StoppedTest(InFolder):
     def test_an_episode_is_measured_to_its_end_although_its_robot_has_stopped(self):
         """Its object may go on moving. With other robots that go on, its episode goes on anyway."""
-        demos = synthesize(SOUP, 1)
+        demos = upright(SOUP, 1)
         policy = load_policy("soup-can")
         steps = round(policy.task.termination.episode_seconds / policy.task.control_dt)
         measure = Round.update_metrics
@@ -171,7 +172,7 @@ class StoppedTest(InFolder):
 class CommandTest(InFolder):
     def test_a_verdict_from_the_command_line(self):
         demos = self.folder / "demos.npz"
-        succeeds("demos synth --objects", SOUP, "--per-object 1 --out", demos)
+        write_demos(demos, upright(SOUP, 1))
         policy = shipped()["soup-can"]
         options = ("--demos", demos, "--engine mujoco --episodes 1 --out", self.folder)
         faults = "--property published-faults=0.5 --property lost-frames=1.2"

@@ -151,7 +151,7 @@ class PageTest(unittest.TestCase):
         cls.browser = Browser(program)
         cls.addClassCleanup(cls.browser.close)
 
-    def open(self, width=480, height=360, *, phone=False):
+    def open(self, width=480, height=480, *, phone=False):
         self.addCleanup(self.browser.open, "about:blank")
         self.browser.problems.clear()
         self.browser.resize(width, height, phone=phone)

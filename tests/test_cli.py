@@ -164,6 +164,20 @@ class UsageTest(TestCase):
             (r"--out is 'x', expected a name that ends in \.json or \.md", "engines check --out x"),
             (r"--out is 'x\.md', expected", "engines compare x.npz --out x.md"),
             (r"--picture is 'x\.jpg', expected", "robots check openarm --picture x.jpg"),
+            (r"--out is '\.', expected a file, not a folder", "retarget d.npz --robot x --out ."),
+            (
+                r"cannot write /dev/null/x\.npz: /dev/null is a file, expected a folder",
+                "goals nothing --robot x --out /dev/null/x.npz",
+            ),
+            (r"/dev/null/run: /dev/null is a file", "train --resets d.npz --out /dev/null/run"),
+            (
+                rf"{__file__} is a file, expected a folder of meshes",
+                f"objects --meshes {__file__}",
+            ),
+            (
+                rf"{__file__} is a file, expected a robot's name, or the folder of its robot",
+                f"goals soup --out x.npz --robot {__file__}",
+            ),
             (
                 r"--out is given more than once. Give the command once for each file",
                 "view x.npz --out x.png --out x.mp4",
@@ -453,6 +467,11 @@ class VerbTest(TestCase):
 
 
 class OutputTest(InFolder):
+    def test_a_read_only_folder_is_refused_at_once(self):
+        with patch("xreset.files.checks.os.access", return_value=False):
+            said = refused("retarget none --robot openarm --out", self.folder / "new/motion.npz")
+        self.assertIn(f"the folder {self.folder} is read-only. Choose another place", said)
+
     def test_a_folder_whose_name_has_a_dot_is_written_again(self):
         def write(*, out: Path) -> None:
             with claim_folder(out):

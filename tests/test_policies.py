@@ -122,6 +122,9 @@ class OnnxPolicyTest(WithPolicy):
         self.assertRaisesRegex(PolicyError, words, OnnxPolicy, checkpoint)
         told = refused("eval", checkpoint, "--demos x.npz")
         self.assertIn(f"{run} is not a run folder", " ".join(told.split()))
+        elsewhere = self.folder / "elsewhere.pt"
+        shutil.copy(checkpoint, elsewhere)
+        self.assertRegex(refused("eval", elsewhere, "--demos x.npz"), "elsewhere.pt is a training")
 
 
 CARD = """schema = "xreset-policy-card/1"

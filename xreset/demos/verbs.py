@@ -14,7 +14,7 @@ from xreset.errors import DemoError
 from xreset.files.checks import (
     Option,
     Options,
-    Output,
+    OutputFile,
     PositiveInt,
     Seed,
     Share,
@@ -32,7 +32,7 @@ else:  # a command has files in place of these
 
 
 @obeys_rules
-def import_dexycb(folder: str | Path, out: Output, *, progress: Progress = unseen) -> Demos:
+def import_dexycb(folder: str | Path, out: OutputFile, *, progress: Progress = unseen) -> Demos:
     """Read DexYCB in its own layout and write an archive of demonstrations.
 
     Args:
@@ -54,7 +54,7 @@ def import_dexycb(folder: str | Path, out: Output, *, progress: Progress = unsee
 @obeys_rules
 def import_keypoints(
     path: str | Path,
-    out: Output,
+    out: OutputFile,
     *,
     order: Literal["mano", "mediapipe", "openpose"],
     units: Literal["m", "mm"],
@@ -119,7 +119,7 @@ def synthesize(
     per_object: PositiveInt = 4,
     seed: Seed = 0,
     *,
-    out: Output | None = None,
+    out: OutputFile | None = None,
     fps: Annotated[float, Option(None)] = 30.0,
     side: Literal["right", "left", "both"] = "right",
     meshes: str | Path | None = None,
@@ -208,8 +208,8 @@ class Selection(Options):
 def select_demos(
     files: Sequence[str | Path],
     *,
-    out: Output | None = None,
-    rest: Output | None = None,
+    out: OutputFile | None = None,
+    rest: OutputFile | None = None,
     selection: Selection = Selection(),
     mirror: bool = False,
     meshes: str | Path | None = None,

@@ -6,6 +6,7 @@ when a configuration is made, instead of turning into NaN some minutes later.
 
 from __future__ import annotations
 
+import os
 import re
 import types
 from collections.abc import Callable, Iterable, Sequence
@@ -35,7 +36,7 @@ from typing import (
 import numpy as np
 
 from xreset import __version__
-from xreset.errors import FileFormatError, WrongValueError
+from xreset.errors import FileFormatError, WrongValueError, XResetError
 from xreset.files.legacy import REMOVED
 from xreset.files.text import Brief, shown
 
@@ -81,19 +82,36 @@ class Option:
     name: str | None
 
 
+def _check_place(path: str | Path) -> None:
+    """Refuse, with ``XResetError``, an output for which there can be no folder: results would be lost at the end."""
+    place = Path(path).absolute()
+    folder = next(each for each in (place, *place.parents) if os.path.exists(each))
+    if folder == place and not os.path.isdir(place):  # a file, which is replaced
+        folder = place.parent
+    if not os.path.isdir(folder):
+        raise XResetError(
+            f"cannot write {path}: {folder} is a file, expected a folder. Choose another place."
+        )
+    if not os.access(folder, os.W_OK):
+        raise XResetError(
+            f"cannot write {path}: the folder {folder} is read-only. Choose another place."
+        )
+
+
 def _ends_in(*suffixes: str) -> Rule:
     """Return the rule for the name of a file whose suffix decides what is written."""
     expected = f"a name that ends in {' or '.join(suffixes)}"
     return Rule(expected, lambda path: Path(path).suffix.lower() in suffixes)
 
 
-Output = Annotated[str | Path, Written()]
+Output = Annotated[str | Path, Written(), Check(_check_place)]
 """File or folder that a function writes."""
-Json = Annotated[str | Path, Written(), _ends_in(".json")]
-JsonOrPage = Annotated[str | Path, Written(), _ends_in(".json", ".md")]
-Mp4 = Annotated[str | Path, Written(), _ends_in(".mp4")]
-Png = Annotated[str | Path, Written(), _ends_in(".png")]
-PngOrMp4 = Annotated[str | Path, Written(), _ends_in(".png", ".mp4")]
+OutputFile = Annotated[Output, Rule("a file, not a folder", lambda path: not os.path.isdir(path))]
+Json = Annotated[OutputFile, _ends_in(".json")]
+JsonOrPage = Annotated[OutputFile, _ends_in(".json", ".md")]
+Mp4 = Annotated[OutputFile, _ends_in(".mp4")]
+Png = Annotated[OutputFile, _ends_in(".png")]
+PngOrMp4 = Annotated[OutputFile, _ends_in(".png", ".mp4")]
 Positive = Annotated[T, Rule("a number above 0 and finite", lambda x: 0 < x < inf)]
 """JSON, and so a run's configuration, has no infinity."""
 NotNegative = Annotated[T, Rule("a number from 0 to 1e15", lambda x: 0 <= x <= 1e15)]

@@ -54,7 +54,7 @@ def find_policy(policy: str | Path, *, also: Sequence[str] = ()) -> PolicyFile:
         path = path / POLICY
     if os.path.isdir(path):  # unlike Path.is_dir, it takes names of any length
         return _policy_of_run(path)
-    if path.suffix == ".pt" and path.is_file():
+    if path.suffix == ".pt" and path.parent.name == "checkpoints" and path.is_file():
         return _policy_of_checkpoint(path)
     if path.suffix == ".onnx" or os.path.exists(path):
         content = policy_content(path)

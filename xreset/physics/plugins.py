@@ -104,7 +104,9 @@ def robot_folder(name_or_folder: str | Path) -> Path:
         if os.path.isdir(folder):
             return folder.resolve()
         if os.path.isfile(folder):
-            raise RobotError(f"{folder} is a file. Give the robot's folder: {folder.parent}")
+            raise RobotError(
+                f"{folder} is a file, expected a robot's name, or the folder of its {DESCRIPTION}."
+            )
         known = known_plugins(ROBOTS)
         raise RobotError(
             f"Unknown robot {shown(name)}, and no folder has that name. Choose from: {known}; or give the robot's "

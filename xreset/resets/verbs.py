@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from xreset.files.checks import Option, Output, PositiveInt, obeys_rules
+from xreset.files.checks import Option, OutputFile, PositiveInt, obeys_rules
 from xreset.files.progress import NamedProgress, Progress, unseen
 from xreset.physics.plugins import Device
 from xreset.resets.config import (
@@ -42,7 +42,7 @@ def make_bank(
     objects: Sequence[ObjectSpec] | None = None,
     engine: str | Sequence[str] = "mujoco",
     *,
-    out: Output | None = None,
+    out: OutputFile | None = None,
     meshes: str | Path | None = None,
     num_envs: PositiveInt = 64,
     device: Device = "cpu",
@@ -145,7 +145,7 @@ def make_goals(
     names: Sequence[str] | None = None,
     *,
     robot: str | Path | RobotSpec,
-    out: Output | None = None,
+    out: OutputFile | None = None,
     meshes: str | Path | None = None,
     families: Annotated[str | Sequence[str] | None, Option("family")] = None,
     poses: Annotated[Sequence[Pose], Option("pose")] = (),

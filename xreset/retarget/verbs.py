@@ -11,7 +11,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from xreset.files.checks import Option, Output, obeys_rules
+from xreset.files.checks import Option, OutputFile, obeys_rules
 from xreset.files.progress import Progress, unseen
 from xreset.files.storage import file_hash
 from xreset.physics.plugins import Device
@@ -34,7 +34,7 @@ def retarget_demos(
     objects: Sequence[ObjectSpec] | None = None,
     config: RetargetConfig | None = None,
     *,
-    out: Output | None = None,
+    out: OutputFile | None = None,
     meshes: str | Path | None = None,
     trust: Annotated[bool, Option("trust_recordings")] = False,
     device: Device = "cpu",

@@ -1,6 +1,7 @@
 """xreset view: rows of each kind of file, the pictures, and the page (without a browser)."""
 
 import io
+import shlex
 import signal
 import sys
 import time
@@ -274,6 +275,13 @@ class Served(WithFiles):
                 assert_allclose(link.position, poses[kinematics.link_index(name), :3, 3], atol=1e-6)
                 own = scene._robot._colors[name]
                 assert_array_equal(link.color, rgb(tint(own, color) if color else own))
+
+    def test_a_host_that_this_machine_does_not_have_is_refused(self):
+        """viser alone waits for ever."""
+        for host in ("203.0.113.7", "::2", "no host"):
+            told = refused("view", self.retargeted, f"--host={shlex.quote(host)}")
+            self.assertIn(f"Cannot serve the page at {host}:8080: ", told)
+            self.assertIn("Choose another --host or --port", told)
 
     def test_the_page_opens_where_a_hand_is_and_says_what_is_green(self):
         demos = toy_demos()

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from html import escape
 from ipaddress import ip_address
-from socket import getfqdn, gethostname
+from socket import AF_INET, AF_INET6, create_server, getfqdn, gethostname
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -52,6 +52,9 @@ class WebPage:
         with needs("viser, without which --out of xreset view works,", "viewer"):
             import viser
         try:
+            # viser waits for ever where no port of a host can be had
+            family = AF_INET6 if ":" in host else AF_INET
+            create_server((host, 0), family=family).close()
             with _own_page_only(host) as guarded:
                 server = viser.ViserServer(host=host, port=port, label=label, verbose=False)
         except OSError as error:

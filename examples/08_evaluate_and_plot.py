@@ -14,7 +14,7 @@ def main(out: Path, engines: tuple[str, ...] = ("mujoco", "sapien")) -> None:
     from matplotlib import pyplot
 
     unseen = xreset.synthesize(["005_tomato_soup_can"], 1, seed=1)  # or the file of demonstrations
-    policy = "soup-can"  # ships with xreset; a run folder or an .onnx file will do
+    policy = "many-objects"  # ships with xreset; a run folder or an .onnx file will do
     results = xreset.evaluate(policy, unseen, engines, episodes=1, num_envs=1, out=out / "eval")
 
     figure, axes = pyplot.subplots(figsize=(5, 3), layout="constrained")

@@ -20,7 +20,7 @@ from xreset.task.config import TaskConfig, evaluation_task
 
 def main(demos: Path, policy: Path | None = None) -> None:
     """Play the first demonstration's goal from home in MuJoCo and print where the object ends; ``demos``: a file of example 01."""
-    session = onnxruntime.InferenceSession(policy or shipped()["soup-can"])
+    session = onnxruntime.InferenceSession(policy or shipped()["many-objects"])
     contract = json.loads(session.get_modelmeta().custom_metadata_map["xreset"])
     for group in ("policy", "proprio"):  # in this order they are the input `flat`
         print(

@@ -147,6 +147,10 @@ class UsageTest(TestCase):
             ),
             (r"--minutes is nan, expected a number above 0", "train --out x --minutes nan"),
             (
+                r"reach\.width is nan, expected a finite number or a word",
+                "train --out x --config.task.reward.terms.reach.width nan",
+            ),
+            (
                 r"--objects is given more than once. Give all of its values together: --objects A B",
                 "demos synth --out x.npz --objects soup --objects banana",
             ),
@@ -171,7 +175,7 @@ class UsageTest(TestCase):
             ),
             (r"/dev/null/run: /dev/null is a file", "train --resets d.npz --out /dev/null/run"),
             (
-                rf"{__file__} is a file, expected a folder of meshes",
+                rf"{__file__} is a file, not a folder of meshes. Expected NAME",
                 f"objects --meshes {__file__}",
             ),
             (

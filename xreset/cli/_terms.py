@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from contextlib import suppress
 from dataclasses import asdict, fields
+from math import isfinite
 from typing import Any
 
 from xreset.errors import RunError
@@ -47,6 +48,8 @@ def take_terms(config: TrainConfig, arguments: list[str]) -> TrainConfig:
             last = f"{name}.{last}"
             name = None
         given = _value(value if equals else next(words, ""))
+        if isinstance(given, float) and not isfinite(given):
+            raise RunError(f"{flag} is {given}, expected a finite number or a word.")
         terms = changes.setdefault(part, {}).setdefault(table, {})
         if name:
             terms.setdefault(name, {})[last] = given

@@ -37,7 +37,7 @@ def mesh_files(folder: str | Path) -> dict[str, Path]:
     folder = Path(folder)
     expected = "Expected NAME.obj, NAME/textured_simple.obj or NAME/textured.obj."
     if os.path.isfile(folder):
-        raise ObjectError(f"{folder} is a file, expected a folder of meshes. {expected}")
+        raise ObjectError(f"{folder} is a file, not a folder of meshes. {expected}")
     if not os.path.isdir(folder):
         raise ObjectError(f"There is no folder {shown(str(folder))}. {expected}")
     found = {path.stem: path for path in folder.glob("*.obj")}

@@ -179,7 +179,7 @@ class UsageTest(TestCase):
                 f"objects --meshes {__file__}",
             ),
             (
-                rf"{__file__} is a file, expected a robot's name, or the folder of its robot",
+                rf"{__file__} is a file. Expected a robot's name, or the folder of its robot",
                 f"goals soup --out x.npz --robot {__file__}",
             ),
             (

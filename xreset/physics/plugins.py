@@ -104,9 +104,10 @@ def robot_folder(name_or_folder: str | Path) -> Path:
         if os.path.isdir(folder):
             return folder.resolve()
         if os.path.isfile(folder):
-            raise RobotError(
-                f"{folder} is a file, expected a robot's name, or the folder of its {DESCRIPTION}."
-            )
+            fix = f"Expected a robot's name, or the folder of its {DESCRIPTION}."
+            if os.path.isfile(folder.parent / DESCRIPTION):
+                fix = f"Give the robot's folder: {folder.parent}"
+            raise RobotError(f"{folder} is a file. {fix}")
         known = known_plugins(ROBOTS)
         raise RobotError(
             f"Unknown robot {shown(name)}, and no folder has that name. Choose from: {known}; or give the robot's "

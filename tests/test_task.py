@@ -446,8 +446,8 @@ class FlagsTest(TestCase):
         for flags, error, words in (
             (
                 "--config.task.reward.terms.reach.width nan",
-                FileFormatError,
-                "expected terms: name -> ",
+                RunError,
+                "width is nan, expected a finite number or a word",
             ),
             ("--config.task.reward.terms.reach 3", FileFormatError, "expected terms: name -> "),
             ("--config.task.reward.reach-width 3", RunError, "reach_width is no option any more"),

@@ -28,8 +28,8 @@ EASIER = {
     "panda-allegro": "005_tomato_soup_can",
     "ur7e-robotiq": "005_tomato_soup_can",
 }
-"""Objects of these episodes where the policy's first one, a cracker box, is too wide for its jaw, or is turned further than
-in its training."""
+"""Objects of these episodes where the policy's first one, a cracker box, is too wide for its jaw, or is turned further
+than in its training."""
 DRIFT = {"openarm": 3e-5}
 """Largest difference of targets that add up in half a second [rad, m], where rounding makes more than 1e-5."""
 

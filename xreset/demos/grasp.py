@@ -12,12 +12,13 @@ Everything is in a frame with z up and the table at z = 0; the object is its con
 from __future__ import annotations
 
 import numpy as np
+from scipy.linalg import null_space
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from xreset.demos import hand
 from xreset.files.checks import frozen
-from xreset.geometry.shapes import half_spaces, plane_heights
+from xreset.geometry.shapes import half_spaces, plane_heights, shape_mesh
 from xreset.spec import ObjectSpec
 
 TIPS = (4, 8, 12, 16, 20)
@@ -53,6 +54,8 @@ class Solid:
 
     planes: tuple[np.ndarray, ...]
     """[P, 4] per piece: outward unit normal and offset."""
+    corners: tuple[np.ndarray, ...]
+    """[C, 3] per piece: its vertices."""
     vertices: np.ndarray
     """[V, 3]"""
     com: np.ndarray
@@ -65,13 +68,22 @@ class Solid:
     def of(cls, obj: ObjectSpec, pos: np.ndarray, rotation: Rotation) -> Solid:
         """Place an object at a pose."""
         planes = []
+        corners = []
         for piece in obj.pieces:
             own = half_spaces(piece)
             normals = rotation.apply(own[:, :3])
             planes.append(np.column_stack((normals, own[:, 3] - normals @ pos)))
+            corners.append(rotation.apply(shape_mesh(piece).vertices) + pos)
         vertices = rotation.apply(obj.vertices) + pos
         com = rotation.apply(obj.com) + pos
-        return cls(planes=tuple(planes), vertices=vertices, com=com, pos=pos, rotation=rotation)
+        return cls(
+            planes=tuple(planes),
+            corners=tuple(corners),
+            vertices=vertices,
+            com=com,
+            pos=pos,
+            rotation=rotation,
+        )
 
     def distance(self, points: np.ndarray) -> np.ndarray:
         """[...] signed distance of points [..., 3] to the surface [m], negative inside; a lower bound outside, near
@@ -86,25 +98,30 @@ class Solid:
 
         Returns:
             Line parameters of entry and exit [pieces, ...] (entry > exit where the piece is missed), and the normals
-            there [pieces, ..., 3].
+            there [pieces, ..., 3], zero far from the piece.
         """
-        enter = []
-        leave = []
-        normal_in = []
-        normal_out = []
-        for planes in self.planes:
+        enter = np.full((len(self.planes), *origins.shape[:-1]), np.inf)
+        leave = -enter
+        normal_in = np.zeros((*enter.shape, 3))
+        normal_out = np.zeros_like(normal_in)
+        across = null_space(direction[None])
+        shadow = origins @ across
+        for i, (planes, corners) in enumerate(zip(self.planes, self.corners, strict=True)):
+            outline = corners @ across
+            near = (shadow >= outline.min(axis=0)) & (shadow <= outline.max(axis=0))
+            lines = np.nonzero(near.all(axis=-1))
             along, against = np.array([direction, -direction]) @ planes[:, :3].T
             entries = against > 1e-12
             exits = along > 1e-12
-            height = plane_heights(origins, planes)
+            height = plane_heights(origins[lines], planes)
             outside = (height[..., ~entries & ~exits] > 0).any(axis=-1)
             into = height[..., entries] / against[entries]
             out = -height[..., exits] / along[exits]
-            enter.append(np.where(outside, np.inf, into.max(axis=-1)))
-            leave.append(np.where(outside, -np.inf, out.min(axis=-1)))
-            normal_in.append(planes[entries, :3][into.argmax(axis=-1)])
-            normal_out.append(planes[exits, :3][out.argmin(axis=-1)])
-        return np.array(enter), np.array(leave), np.array(normal_in), np.array(normal_out)
+            enter[i][lines] = np.where(outside, np.inf, into.max(axis=-1))
+            leave[i][lines] = np.where(outside, -np.inf, out.min(axis=-1))
+            normal_in[i][lines] = planes[entries, :3][into.argmax(axis=-1)]
+            normal_out[i][lines] = planes[exits, :3][out.argmin(axis=-1)]
+        return enter, leave, normal_in, normal_out
 
 
 @frozen

@@ -24,7 +24,8 @@ ROOT = Path(__file__).resolve().parents[1]
 SMALL = (
     "--config.task.observation.cloud-points 16 --config.task.distance-points 64 --config.model.pointnet 8 6 "
     "--config.model.lstm 12 --config.model.mlp 16 --config.ppo.horizon 8 --config.ppo.mini-epochs 2 "
-    "--config.ppo.minibatch-size 32 --config.save-interval 1 --config.task.reset.adaptive-share 0.5"
+    "--config.model.normalize-returns --config.ppo.minibatch-size 32 --config.save-interval 1 "
+    "--config.task.reset.adaptive-share 0.5"
 )
 
 

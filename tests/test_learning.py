@@ -359,7 +359,7 @@ class ReturnCriticTest(TestCase):
             seen.append(
                 3.0 * torch.randn(4000, generator=torch.Generator().manual_seed(0)) + 7.0 + shift
             )
-            critic.take_returns(seen[-1])
+            critic.take_returns(seen[-1], Processes())
             critic.reset()
             assert_close(critic(obs), before, atol=1e-4, rtol=1e-4)
             everything = torch.cat(seen)

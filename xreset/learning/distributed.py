@@ -1,7 +1,8 @@
 """The processes that train together, as ``torchrun`` starts them.
 
 Each has worlds of its own. They average the gradients of every minibatch (rsl-rl's ``reduce_parameters``) and, after
-every rollout, the demonstrations' rates of success. The first one writes the run's files.
+every rollout, the moments of observations and returns and the demonstrations' rates of success. The first one writes
+the run's files.
 """
 
 from __future__ import annotations
@@ -66,6 +67,10 @@ class Processes:
             values = values.clone()
             torch.distributed.all_reduce(values)
         return values
+
+    def mean(self, values: torch.Tensor) -> torch.Tensor:
+        """Return the mean of a tensor over all processes."""
+        return self.sum(values) / self.count
 
 
 def leave() -> None:

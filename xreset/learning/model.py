@@ -20,6 +20,7 @@ from torch.distributions import Normal
 
 from xreset.errors import needs
 from xreset.learning.config import ModelConfig, TrainConfig
+from xreset.learning.distributed import Processes
 
 with needs("rsl-rl-lib", "train"):
     from rsl_rl.models import MLPModel
@@ -373,15 +374,18 @@ class ReturnCritic(PointNetLstmModel):
         return self.return_mean + self.return_std * super().forward(*args, **options)
 
     @torch.no_grad()
-    def take_returns(self, returns: Tensor) -> None:
-        """Take a rollout's returns into mean and deviation; the values of observations do not change."""
+    def take_returns(self, returns: Tensor, processes: Processes) -> None:
+        """Take all processes' returns into mean and deviation; the values of observations do not change."""
         self.rollouts += 1
         rate = (1.0 / self.rollouts).clamp_min(self.RATE)
-        shift = returns.mean() - self.return_mean
+        own = returns.mean()
+        center = processes.mean(own)
+        spread = processes.mean(returns.var(unbiased=False) + (own - center).square())
+        shift = center - self.return_mean
         mean = self.return_mean + rate * shift
         variance = (
             (1 - rate) * self.return_std.square()
-            + rate * returns.var(unbiased=False)
+            + rate * spread
             + rate * (1 - rate) * shift.square()
         )
         std = variance.sqrt().clamp_min(1e-3)

@@ -91,6 +91,7 @@ class SequencePpo(PPO):
             multi_gpu_cfg=processes.ranks,
         )
         self.networks = {"actor": actor, "critic": critic}
+        self.processes = processes
         self.sequence_length = p.sequence_length
         self.bounds_loss = p.bounds_loss
         on_gpu = device.startswith("cuda")
@@ -135,7 +136,7 @@ class SequencePpo(PPO):
         """
         storage = self.storage
         if isinstance(self.critic, ReturnCritic):
-            self.critic.take_returns(storage.returns)
+            self.critic.take_returns(storage.returns, self.processes)
         self._rate.fill_(self.learning_rate)
         self._use_rate()
         self._sums.zero_()

@@ -229,7 +229,7 @@ class TrainingRunner:
         self._check_finite(obs)
         # each process plays its own episodes of the same demonstrations
         rates = self.env.resets.success_rate
-        rates.copy_(self.processes.sum(rates) / self.processes.count)
+        rates.copy_(self.processes.mean(rates))
         return obs
 
     def _check_finite(self, obs: TensorDict) -> None:

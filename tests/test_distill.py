@@ -18,9 +18,9 @@ from xreset.errors import PolicyError, XResetError
 from xreset.eval.report.fairness import missed_by_student
 from xreset.learning.checkpoint import read_checkpoint
 from xreset.learning.config import PpoConfig, TrainConfig
+from xreset.learning.from_onnx import network_of
 from xreset.learning.recipes import student_config
 from xreset.learning.run import TEACHER, latest_checkpoint, read_run
-from xreset.learning.teacher import load_teacher
 from xreset.learning.train import config_of_student
 from xreset.objects.catalogue import load_objects
 from xreset.policy.onnx_policy import OnnxPolicy, check_contract
@@ -70,7 +70,7 @@ class DistillTest(WithBank):
 
     def test_every_policy_that_ships_can_teach(self):
         for file in shipped().values():  # in float16, and of a history of clouds
-            load_teacher(path=file)  # which compares its actions with the file's
+            network_of(OnnxPolicy(file))  # which compares its actions with the file's
 
     def test_the_run_is_a_policy_that_sees(self):
         info = read_run(self.run_folder)

@@ -46,6 +46,7 @@ from xreset.learning.checkpoint import load_moments, read_checkpoint
 from xreset.learning.config import ScheduleConfig, TrainConfig
 from xreset.learning.export import exported
 from xreset.learning.exported import read_policy
+from xreset.learning.from_onnx import network_of
 from xreset.learning.recipes import RECIPES, own_terms_flags, starting_config
 from xreset.learning.run import (
     checkpoints,
@@ -558,6 +559,35 @@ class TrainingTest(WithBank):
             content.actor_state_dict[count], int(before.actor_state_dict[count]) + 8 * 4
         )
 
+    def test_a_policy_learns_on(self):
+        """Its actor stays as it is until the new critic has learned, also after a kill."""
+        policy = self.out / "policy.onnx"
+        given = network_of(OnnxPolicy(policy)).state_dict()
+        ppo = replace(CONFIG.ppo, average=0.08)
+        config = replace(starting_config(str(policy)), ppo=ppo, iterations=1, save_interval=1)
+        self.assertEqual(config.task, CONFIG.task)
+        with (
+            patch("xreset.learning.train.CRITIC_ITERATIONS", 2),
+            patch("xreset.learning.runner.CRITIC_ITERATIONS", 2),
+        ):
+            out = self.train("on", config=config, weights=policy)
+            before = newest(out)
+            self.resume(out, iterations=3)
+        info = read_run(out)
+        self.assertEqual((info.weights, info.weights_hash), (str(policy), file_hash(policy)))
+        first, second, third = map(read_checkpoint, checkpoints(out))
+        networks = [content.actor_state_dict for content in (first, second, third)]
+        moving = [name for name in given if name.endswith(("weight", "bias"))]
+        for name in moving:
+            assert_close(networks[1][name], given[name])
+        self.assertFalse(any(torch.equal(networks[2][name], given[name]) for name in moving))
+        assert_close(networks[1]["trunk.normalizer._mean"], given["trunk.normalizer._mean"])
+        name = "mlp.0.weight"
+        critics = [content.critic_state_dict[name] for content in (first, second)]
+        self.assertFalse(torch.equal(*critics))
+        self.assertLess(third.learning_rate, CONFIG.ppo.learning_rate / 10)
+        assert_close(before.average_state_dict[name], given[name])
+
     def test_the_policy_has_the_running_mean_of_the_weights(self):
         self.assertFalse(newest(self.out).average_state_dict, "no mean was asked for")
         config = replace(CONFIG, iterations=3, ppo=replace(CONFIG.ppo, average=0.5))
@@ -671,7 +701,12 @@ class TrainingTest(WithBank):
             ("another observation layout", {"weights": self.out, "config": short}),
             (r"{'lstm': 12}, .*{'lstm': 16}.*--recipe", {"weights": self.out, "config": wide}),
             (r"layout .*--recipe .*run$", {"weights": self.out, "config": short}),
-            ("many-objects has no critic .* Give a run folder", {"weights": "many-objects"}),
+            ("policy of the robot 'ur7e-sharpa', not of 'openarm'", {"weights": "many-objects"}),
+            ("sees through cameras", {"weights": "many-objects-camera", "config": None}),
+            (
+                r"{'lstm': 12}, .*{'lstm': 16}",
+                {"weights": self.out / "policy.onnx", "config": wide},
+            ),
             ("000002.pt is a file. Give the folder", {"weights": latest_checkpoint(self.out)}),
             (f"folder above has one: give {self.out}", {"weights": self.out / "checkpoints"}),
             ("this training has no teacher", {"config": idle}),

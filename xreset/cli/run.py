@@ -38,7 +38,8 @@ def run(
     out: str | Path,
     meshes: str | Path | None = None,
     engine: str | Sequence[str] = (),
-    recipe: str = "default",
+    recipe: str | None = None,
+    weights: str | Path | None = None,
     device: Device | None = None,
     num_envs: PositiveInt = 4096,
     minutes: PositiveFloat | None = None,
@@ -58,7 +59,9 @@ def run(
         out: run folder to make, or to continue.
         meshes: folder of real meshes; default: the built-in stand-ins.
         engine: physics engine to evaluate in, or several; default: all that can be used here.
-        recipe: recipe of the training, or another run's folder.
+        recipe: recipe of the training, or another run's folder; default: the recipe of the headline results, or that
+            of the weights.
+        weights: policy or run with which the training starts, as in xreset train.
         device: where to train: cpu or cuda; default: cuda where there is a GPU.
         num_envs: worlds of the training.
         minutes: time of the whole training, without compiling kernels; default: 25, unless iterations are given.
@@ -72,7 +75,7 @@ def run(
     from xreset.demos.archive import read_demos
     from xreset.eval.study.steps import engines_left
     from xreset.geometry.description import load_robot
-    from xreset.learning.recipes import starting_config
+    from xreset.learning.recipes import default_config, starting_config
     from xreset.learning.verbs import ENGINE
     from xreset.resets.schedule import shared_worlds
     from xreset.retarget.file import read_retargeted
@@ -83,7 +86,8 @@ def run(
     # what the last steps would refuse, after minutes of work; engines last, because they take seconds to load
     archive = read_demos(demos)
     spec = load_robot(robot)
-    task = starting_config(recipe).task
+    config = starting_config(recipe) if recipe else default_config(weights)[1]
+    task = config.task
     shared_worlds(archive.object_names, num_envs, task.reset.object_share)
     named = [engine] if isinstance(engine, str) else engine
     engines = [each.name for each in quick_engines(named, "cpu")]
@@ -118,6 +122,7 @@ def run(
         robot=robot,
         meshes=meshes,
         recipe=recipe,
+        weights=weights,
         device=device,
         num_envs=num_envs,
         minutes=minutes,

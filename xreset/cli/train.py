@@ -43,7 +43,7 @@ def command_for(arguments: list[str]) -> Callable[..., None]:
     elif recipe:
         config = starting_config(recipe)
     else:
-        recipe, config = default_config(given.goals, given.weights)
+        recipe, config = default_config(given.weights)
     config = take_terms(config, arguments)
     if given.help_config is not None:
         _show_config(given.help_config.removeprefix("config."), config)

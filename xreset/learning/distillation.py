@@ -18,9 +18,10 @@ from torch import Tensor
 
 from xreset.learning.config import TrainConfig
 from xreset.learning.distributed import Processes
+from xreset.learning.from_onnx import network_of
 from xreset.learning.model import make_actor
 from xreset.learning.ppo import GRAD_NORM, first_steps, piece_states
-from xreset.learning.teacher import load_teacher
+from xreset.policy.onnx_policy import OnnxPolicy
 
 
 class SequenceDistillation(Distillation):
@@ -29,6 +30,7 @@ class SequenceDistillation(Distillation):
     Attributes:
         networks: name -> network that a checkpoint holds. The teacher is in a file of its own.
         teacher_share: share of the worlds in which the teacher acts.
+        critic_only: as for :class:`~xreset.learning.ppo.SequencePpo`; there is no critic.
     """
 
     def __init__(
@@ -45,7 +47,7 @@ class SequenceDistillation(Distillation):
         student = make_actor(obs, num_actions, config)
         super().__init__(
             student,
-            load_teacher(teacher),
+            network_of(OnnxPolicy(teacher)),
             RolloutStorage("distillation", len(obs), p.horizon, obs, [num_actions], device),
             num_learning_epochs=p.mini_epochs,
             gradient_length=1,
@@ -58,6 +60,7 @@ class SequenceDistillation(Distillation):
         self.sequence_length = p.sequence_length
         self.num_mini_batches = p.minibatches(len(obs))
         self.teacher_share = 0.0
+        self.critic_only = False
 
     def act(self, obs: TensorDict) -> Tensor:
         """[N, J] the actions to take: the student's, and the teacher's in the first of the worlds."""

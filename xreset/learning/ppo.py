@@ -58,6 +58,7 @@ class SequencePpo(PPO):
 
     Attributes:
         networks: name -> network that a checkpoint holds.
+        critic_only: whether the actor stays as it is.
     """
 
     def __init__(
@@ -92,6 +93,7 @@ class SequencePpo(PPO):
         )
         self.networks = {"actor": actor, "critic": critic}
         self.processes = processes
+        self.critic_only = False
         self.sequence_length = p.sequence_length
         self.bounds_loss = p.bounds_loss
         on_gpu = device.startswith("cuda")
@@ -140,6 +142,7 @@ class SequencePpo(PPO):
         self._rate.fill_(self.learning_rate)
         self._use_rate()
         self._sums.zero_()
+        learn = self._learn_values if self.critic_only else self._learn_from_minibatch
         orders = [
             torch.randperm(storage.num_envs, device=self.device)
             for _ in range(self.num_learning_epochs)
@@ -150,7 +153,7 @@ class SequencePpo(PPO):
                     self._worlds.copy_(worlds)
                 else:
                     self._worlds = worlds
-                self._graphs.run(self._learn_from_minibatch)
+                self._graphs.run(learn)
         observations = storage.observations.flatten(0, 1)
         self.actor.update_normalization(observations)
         self.critic.update_normalization(observations)
@@ -165,13 +168,10 @@ class SequencePpo(PPO):
         worlds = self._worlds
         observations = storage.observations[:, worlds]
         first = first_steps(storage, worlds)
-        state, critic_state = (
-            piece_states(saved, worlds, self.sequence_length)
-            for saved in (storage.saved_hidden_state_a, storage.saved_hidden_state_c)
-        )
+        state = piece_states(storage.saved_hidden_state_a, worlds, self.sequence_length)
         self.actor(observations, masks=first, hidden_state=state, stochastic_output=True)
         log_prob = self.actor.get_output_log_prob(storage.actions[:, worlds])
-        values = self.critic(observations, masks=first, hidden_state=critic_state)
+        value = self._value_loss(observations, first)
         entropy = self.actor.output_entropy.mean()
         self._adapt_rate(tuple(p[:, worlds] for p in storage.distribution_params or ()))
         self._use_rate()
@@ -179,14 +179,24 @@ class SequencePpo(PPO):
         ratio = torch.exp(log_prob - storage.actions_log_prob[:, worlds, 0])
         clipped = ratio.clamp(1.0 - self.clip_param, 1.0 + self.clip_param)
         surrogate = torch.max(-advantages * ratio, -advantages * clipped).mean()
-        value = self._value_loss(values, storage.values[:, worlds], storage.returns[:, worlds])
         excess = (self.actor.output_mean.abs() - BOUND).clamp_min(0.0).square().sum(dim=-1).mean()
-        loss = (
+        self._descend(
             surrogate
             + self.value_loss_coef * value
             - self.entropy_coef * entropy
             + self.bounds_loss * excess
         )
+        self._sums += torch.stack((value, surrogate, entropy, excess)).detach()
+
+    def _learn_values(self) -> None:
+        """Like :meth:`_learn_from_minibatch`, for the critic alone."""
+        observations = self.storage.observations[:, self._worlds]
+        value = self._value_loss(observations, first_steps(self.storage, self._worlds))
+        self._descend(self.value_loss_coef * value)
+        self._sums[0] += value.detach()
+
+    def _descend(self, loss: Tensor) -> None:
+        """Take one step of the optimizer."""
         self.optimizer.zero_grad()
         loss.backward()
         if self.is_multi_gpu:
@@ -194,10 +204,16 @@ class SequencePpo(PPO):
         for model in (self.actor, self.critic):
             torch.nn.utils.clip_grad_norm_(model.parameters(), self.max_grad_norm)
         self.optimizer.step()
-        self._sums += torch.stack((value, surrogate, entropy, excess)).detach()
 
-    def _value_loss(self, values: Tensor, old_values: Tensor, returns: Tensor) -> Tensor:
-        """Return the mean squared error of values, in units of the returns' deviation if the critic knows it."""
+    def _value_loss(self, observations: TensorDict, first: Tensor) -> Tensor:
+        """Return the mean squared error of the values of the minibatch of ``_worlds``, in units of the returns'
+        deviation if the critic knows it."""
+        storage = self.storage
+        worlds = self._worlds
+        state = piece_states(storage.saved_hidden_state_c, worlds, self.sequence_length)
+        values = self.critic(observations, masks=first, hidden_state=state)
+        old_values = storage.values[:, worlds]
+        returns = storage.returns[:, worlds]
         unit = self.critic.return_std if isinstance(self.critic, ReturnCritic) else 1.0
         error = (values - returns) / unit
         near = old_values + unit * ((values - old_values) / unit).clamp(

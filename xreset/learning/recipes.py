@@ -13,12 +13,13 @@ from pathlib import Path
 from typing import Any
 
 from xreset.cameras.config import VisionConfig
-from xreset.errors import RunError
+from xreset.errors import PolicyError, RunError
 from xreset.files.checks import from_dict, frozen, merged
 from xreset.files.storage import read_toml
 from xreset.files.text import plain, shown
 from xreset.learning.config import ModelConfig, PpoConfig, TrainConfig
 from xreset.learning.run import read_run
+from xreset.policy.shipped import shipped_name
 from xreset.spec import RobotSpec
 from xreset.task.config import TaskConfig
 
@@ -102,37 +103,42 @@ RECIPES = _read_recipes()
 """Name -> recipe."""
 
 
-def default_config(goals: Any, weights: str | Path | None) -> tuple[str, TrainConfig]:
-    """Return where the configuration comes from if nothing is said, and the configuration.
-
-    With goals and the weights of a run, it is that run's configuration. Otherwise it is the recipe ``default``.
-    """
-    if goals is None or weights is None or not (Path(weights) / "run.json").is_file():
+def default_config(weights: str | Path | None) -> tuple[str, TrainConfig]:
+    """Return where the configuration comes from if nothing is said, and the configuration: that of the run or of the
+    policy whose weights are given, else the recipe ``default``."""
+    if weights is None:
         return "default", TrainConfig()
     return str(weights), starting_config(str(weights))
 
 
 def starting_config(recipe: str) -> TrainConfig:
-    """Return the configuration of a recipe, of a file, or of a run, without reward terms that a user added.
+    """Return the configuration of a recipe, of a file, of a run or of a policy, without reward terms that a user added.
 
     Such a term names code to import. A file must not decide that, so the user has to name the terms again. A note on
     standard error says so.
 
     Args:
-        recipe: name of a recipe, a file of the user's own (``.toml``), or a run folder.
+        recipe: name of a recipe, a file of the user's own (``.toml``), a run folder, or a policy: its file
+            (``.onnx``), or its name if it ships with xreset.
 
     Raises:
         RunError: it is none of them.
         FileFormatError: the file or the run is damaged.
+        PolicyError: the policy is damaged, or sees through cameras.
     """
     if recipe in RECIPES:
         return RECIPES[recipe].config
-    if not Path(recipe).exists():
+    if is_policy(recipe):
+        config = _config_of_policy(recipe)
+    elif not Path(recipe).exists():
         known = "; ".join(f"{name}, {each.about}" for name, each in RECIPES.items())
         raise RunError(
-            f"There is no recipe, no file and no run folder {recipe!r}. Recipes: {known}."
+            f"There is no recipe, file, run folder or policy {recipe!r}. Recipes: {known}."
         )
-    config = read_recipe(Path(recipe)) if recipe.endswith(".toml") else read_run(recipe).config
+    elif recipe.endswith(".toml"):
+        config = read_recipe(Path(recipe))
+    else:
+        config = read_run(recipe).config
     reward = config.task.reward
     if reward.own:
         flags = own_terms_flags(reward.own)
@@ -143,6 +149,29 @@ def starting_config(recipe: str) -> TrainConfig:
             file=sys.stderr,
         )
     return replace(config, task=replace(config.task, reward=reward.without_own()))
+
+
+def is_policy(name: str) -> bool:
+    """Whether this is the file of an exported policy, or the name of one that ships with xreset."""
+    return name.endswith(".onnx") or (not Path(name).exists() and shipped_name(name) is not None)
+
+
+_STD = 0.15
+"""Standard deviation of the actions with which a policy learns on: its file does not have that of its training."""
+
+
+def _config_of_policy(name: str) -> TrainConfig:
+    """Return the default configuration with the task and the layers of a policy."""
+    from xreset.learning.exported import read_policy
+    from xreset.learning.from_onnx import layers_of
+
+    policy = read_policy(name)
+    task = policy.contract.task
+    if task.vision.cameras:
+        raise PolicyError(
+            f"{name} sees through cameras. Give a policy that is told pose and shape, or train a student (--teacher)."
+        )
+    return TrainConfig(task=task, model=replace(layers_of(policy), initial_std=_STD))
 
 
 def from_home(config: TrainConfig) -> TrainConfig:

@@ -29,10 +29,12 @@ from xreset.learning.checkpoint import (
 from xreset.learning.config import TrainConfig, value_at
 from xreset.learning.distillation import SequenceDistillation
 from xreset.learning.distributed import Processes
+from xreset.learning.from_onnx import network_of
 from xreset.learning.log import TrainingLog
-from xreset.learning.ppo import SequencePpo
+from xreset.learning.ppo import SLOWEST, SequencePpo
 from xreset.learning.recipes import resume_command
 from xreset.physics.tensors import one_thread
+from xreset.policy.onnx_policy import OnnxPolicy
 
 MAX_FAULTY_SHARE = 1e-3
 """Largest share of world-steps that may break; the run ends beyond it."""
@@ -42,6 +44,12 @@ transitions 0.9, 1.1 and 1.3 times as fast on a free core, and waits in a busy l
 next to two busy processes on two cores is then slower by a third."""
 FAULT_WINDOW = 200
 """Iterations over which the share is taken. The first iterations may use the allowance of the whole window."""
+
+CRITIC_ITERATIONS = 30
+"""Iterations in which the new critic of a policy that learns on learns alone: a critic that knows nothing would undo in
+some iterations what the policy has learned."""
+_OBSERVED = 100_000_000
+"""Observations that the normalization of a policy that learns on counts as seen: those of a training of 15 minutes."""
 
 
 class TrainingRunner:
@@ -173,6 +181,10 @@ class TrainingRunner:
         schedule = self.config.schedule
         if schedule.teacher and isinstance(self.alg, SequenceDistillation):
             self.alg.teacher_share = value_at(schedule.teacher, progress)
+        if self.alg.critic_only:
+            self.alg.critic_only = self.iteration < CRITIC_ITERATIONS
+            if not self.alg.critic_only:
+                self.alg.learning_rate = SLOWEST
 
     def _iterate(self, obs: TensorDict, log: TrainingLog | None) -> TensorDict:
         """Collect a rollout, learn from it and write the log; return the last observations."""
@@ -308,6 +320,16 @@ class TrainingRunner:
         """
         content = self._load(path)
         self.alg.learning_rate = content.learning_rate
+
+    def load_policy(self, policy: OnnxPolicy) -> None:
+        """Start with the actor of an exported policy. The critic is new, and learns alone in the first iterations."""
+        network = network_of(policy)
+        actor = self.alg.networks["actor"]
+        actor.load_state_dict(actor.state_dict() | network.state_dict())
+        # the policy was trained with this normalization, which new observations must not replace
+        actor.trunk.normalizer.count.fill_(_OBSERVED)
+        for name, mean in self._average.items():
+            mean.copy_(actor.state_dict()[name])
 
     def _load(self, path: Path) -> Checkpoint:
         """Read a checkpoint, and load its networks."""

@@ -30,7 +30,8 @@ from xreset.learning.config import TrainConfig
 from xreset.learning.distributed import Processes, leave
 from xreset.learning.export import export_checkpoint
 from xreset.learning.exported import read_policy
-from xreset.learning.recipes import own_terms_flags, student_config
+from xreset.learning.from_onnx import layers_of
+from xreset.learning.recipes import is_policy, own_terms_flags, student_config
 from xreset.learning.run import (
     TEACHER,
     RunInfo,
@@ -41,10 +42,9 @@ from xreset.learning.run import (
     training_left,
     write_run,
 )
-from xreset.learning.runner import TrainingRunner
+from xreset.learning.runner import CRITIC_ITERATIONS, TrainingRunner
 from xreset.physics.plugins import device_for
 from xreset.policy.onnx_policy import OnnxPolicy, check_contract
-from xreset.policy.shipped import shipped_name
 from xreset.resets.bank import ResetBank, read_bank, write_bank
 from xreset.resets.goals import GoalSet, read_goals, with_goals, write_goals
 from xreset.resets.inputs import Inputs, load_inputs
@@ -248,35 +248,47 @@ def check_config(config: TrainConfig, inputs: Inputs, *, has_teacher: bool) -> N
         )
 
 
-def checkpoint_to_start_from(run: Path, robots: Sequence[RobotSpec], config: TrainConfig) -> Path:
-    """Return the newest checkpoint of another run, whose networks must be like those of this run."""
-    if run.suffix == ".onnx" or (not run.exists() and shipped_name(str(run))):
-        raise RunError(
-            f"{run} has no critic and no checkpoint, so no training can start from it. Give a run folder (--weights)."
-        )
-    other = read_run(run)
-    if other.teacher is not None:
-        raise RunError(
-            f"{run} is the run of a student (--teacher) and has no critic, so no training can start from it. Give "
-            f"another run (--weights), or continue the student: xreset train --out {run}"
-        )
-    start = f"Start from its configuration, with recipe=... or --recipe {run}"
+def networks_to_start_with(
+    weights: str | Path, robots: Sequence[RobotSpec], config: TrainConfig
+) -> tuple[Path, str]:
+    """Return the newest checkpoint of another run, or a policy, whose networks must be like those of this run; and the
+    hash of the file."""
+    name = str(weights)
+    if is_policy(name):
+        policy = read_policy(name)
+        contract = policy.contract
+        theirs = layers_of(policy).layers
+        # a policy has no critic
+        del theirs["critic_mlp"], theirs["normalize_returns"]
+        found = (policy.path, policy.hash)
+    else:
+        run = read_run(name)
+        if run.teacher is not None:
+            raise RunError(
+                f"{name} is the run of a student (--teacher) and has no critic, so no training can start from it. Give "
+                f"another run (--weights), or continue the student: xreset train --out {name}"
+            )
+        contract = run.contract
+        theirs = run.config.model.layers
+        checkpoint = latest_checkpoint(Path(weights))
+        found = (checkpoint, file_hash(checkpoint))
+    start = f"Start from its configuration, with recipe=... or --recipe {name}"
     for robot in robots:
         try:
-            check_contract(str(run), other.contract, robot, config.task)
+            check_contract(name, contract, robot, config.task)
         except PolicyError as error:
-            if other.contract.task.joint_slots is None and other.contract.robot != robot.name:
+            if contract.task.joint_slots is None and contract.robot != robot.name:
                 raise
             raise PolicyError(f"{error} {start}") from error
-    layers = config.model.layers
-    differing = [name for name, value in other.config.model.layers.items() if value != layers[name]]
+    ours = config.model.layers
+    differing = [layer for layer, value in theirs.items() if value != ours[layer]]
     if differing:
-        theirs = {name: other.config.model.layers[name] for name in differing}
-        ours = {name: layers[name] for name in differing}
+        theirs = {layer: theirs[layer] for layer in differing}
+        ours = {layer: ours[layer] for layer in differing}
         raise RunError(
-            f"The networks of {run} have the layers {theirs}, this run's {ours}. {start}"
+            f"The networks of {name} have the layers {theirs}, this run's {ours}. {start}"
         )
-    return latest_checkpoint(run)
+    return found
 
 
 def read_teacher(name: str | Path, inputs: Inputs, config: TrainConfig) -> OnnxPolicy:
@@ -425,10 +437,14 @@ def run_training(
             env.vision.check_sees_objects()
         teacher = out / TEACHER if info.teacher else None
         runner = TrainingRunner(env, info.config, out, teacher=teacher, wandb=wandb)
+        learns_on = info.weights is not None and is_policy(info.weights)
         if newest is not None:
             runner.load_checkpoint(newest)
+        elif learns_on:
+            runner.load_policy(read_policy(str(info.weights)))
         elif info.weights is not None:
             runner.load_networks(Path(info.weights))
+        runner.alg.critic_only = learns_on and runner.iteration < CRITIC_ITERATIONS
         if processes.is_main:
             _write_start(out, info, runner.iteration, is_new=newest is None, resumed=resumed)
         stopped_by = runner.learn(info.total, minutes=info.minutes)

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 from xreset.cameras.config import CameraConfig
 from xreset.errors import RunError, XResetError
 from xreset.files.checks import Option, Output, PositiveFloat, PositiveInt, Seed, obeys_rules
-from xreset.files.storage import file_hash
 from xreset.learning.config import TrainConfig
 from xreset.learning.recipes import default_config, for_robots, from_home, starting_config
 from xreset.learning.run import RobotData, RunInfo, checkpoints, read_run
@@ -77,11 +76,12 @@ def train(
         seed: seed of every random number; default: 0.
         recipe: where the configuration starts from: a recipe (default, robust, minutes, any_object, live, paper,
             published), a TOML file of your own with the tables that it changes (docs/clusters.md), or another run's
-            folder. Options --config.* change it; see them with xreset train --help-config [PART]. Reward terms of your
-            own are not taken from a file or a run; name them again. Default: the recipe of the headline results; with
-            weights and goals, the run of the weights.
+            folder, or a policy. Options --config.* change it; see them with xreset train --help-config [PART]. Reward
+            terms of your own are not taken from a file or a run; name them again. Default: the recipe of the headline
+            results; with weights, that of the weights.
         weights: another run's folder: start with the networks of its newest checkpoint, including the standard
-            deviation of the actions and the learning rate.
+            deviation of the actions and the learning rate. Or an exported policy (.onnx), or the name of one that ships
+            with xreset: it has no critic, so a new one learns alone in the first iterations.
         teacher: run folder, exported policy (.onnx), or name of a policy that ships with xreset: a student learns its
             actions, in its task, from what cameras show (DAgger). Images and their timing: --help-config task.vision.
         cameras: camera of a student: front, side, or wrist, or two of them; default: front.
@@ -118,7 +118,7 @@ def train(
         training.refuse_options(out, given, config)
         own = config.task.reward.own if config else None
         return training.resume(out, own=own, **length)
-    config = _configuration(config, recipe, weights, teacher, cameras, goals)
+    config = _configuration(config, recipe, weights, teacher, cameras)
     if num_envs is None:
         num_envs = _WORLDS if teacher is None else _WORLDS_OF_STUDENT
     # before torch is imported and meshes are cut
@@ -145,7 +145,7 @@ def train(
     version = backend_class(engine).engine_version()  # fails where the engine is missing
     start = None
     if weights is not None:
-        start = training.checkpoint_to_start_from(Path(weights), robots, config)
+        start = training.networks_to_start_with(weights, robots, config)
     teacher_policy = None
     if teacher is not None:
         teacher_policy = training.read_teacher(teacher, inputs, config)
@@ -161,8 +161,8 @@ def train(
         seed=seed or 0,
         config=config,
         contract=policy_contract(inputs.robot, config.task, _object_names(loaded), robots[1:]),
-        weights=str(start) if start else None,
-        weights_hash=file_hash(start) if start else None,
+        weights=str(start[0]) if start else None,
+        weights_hash=start[1] if start else None,
         teacher=str(teacher) if teacher else None,
         others=tuple(map(_robot_data, loaded[1:])),
         iterations=iterations,
@@ -248,7 +248,6 @@ def _configuration(
     weights: str | Path | None,
     teacher: str | Path | None,
     cameras: str | CameraConfig | Sequence[str | CameraConfig],
-    goals: str | Path | GoalSet | None,
 ) -> TrainConfig:
     """Return the configuration that was given, or the one that the other arguments of :func:`train` decide."""
     if teacher is not None and (recipe is not None or weights is not None):
@@ -264,7 +263,7 @@ def _configuration(
         return config_of_student(teacher, cameras or "front")
     if recipe is not None:
         return starting_config(str(recipe))
-    return default_config(goals, weights)[1]
+    return default_config(weights)[1]
 
 
 def _device(device: str | None, engine: str, present: RunInfo | None) -> str:

@@ -1,9 +1,9 @@
-"""A trained policy as a network that teaches: exported policies hold all weights, so no checkpoint is needed."""
+"""The network of an exported policy, which teaches a student or learns on: the file holds all weights."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -23,47 +23,60 @@ _CLOSE = 1e-3
 """Largest difference between an action of the file and one of the network."""
 
 
-def load_teacher(path: Path) -> PointNetLstmModel:
+def network_of(policy: OnnxPolicy) -> PointNetLstmModel:
     """Return the network of an exported policy, in evaluation mode on the CPU.
 
     Raises:
-        PolicyError: the file is no policy, or is built in another way than this version exports policies.
+        PolicyError: the network is built in another way than this version exports policies.
     """
-    import onnx
-
-    policy = OnnxPolicy(path)
-    shapes = observation_shapes(policy.contract, str(path))
+    shapes = observation_shapes(policy.contract, str(policy.path))
     observations = TensorDict(
         {name: torch.randn(2, *shape) for name, shape in shapes.items()}, batch_size=[2]
     )
-    try:
-        graph = onnx.load(str(path)).graph
-        weights = _weights(graph)
+    with _rebuilding(policy):
+        weights = _weights(policy)
         model = PointNetLstmModel(
             observations,
             list(shapes),
             policy.contract.num_actions,
-            ModelConfig(
-                pointnet=_widths(weights, "trunk.pointnet.mlp."),
-                lstm=weights["trunk.lstm.weight_hh_l0"].shape[1],
-                mlp=_widths(weights, "mlp.")[:-1],
-            ),
+            _layers(weights),
             clip=policy.contract.task.joint_slots is not None,
         )
         model.load_state_dict(model.state_dict() | weights)
         model.eval()
         with torch.no_grad():
             difference = (model(observations).clamp(-1, 1) - policy.act(observations)).abs().max()
-    except (KeyError, IndexError, StopIteration, RuntimeError, ValueError) as error:
-        raise PolicyError(
-            f"{path} cannot teach: its network is not built as xreset exports it ({error})."
-        ) from error
     if not difference < _CLOSE:
         raise PolicyError(
-            f"{path} cannot teach: rebuilt from its file, its network acts otherwise ({difference:.2g})."
+            f"{policy.path} cannot be trained or teach: rebuilt from its file, its network acts otherwise "
+            f"({difference:.2g})."
         )
     model.reset()
     return model.requires_grad_(False)
+
+
+def layers_of(policy: OnnxPolicy) -> ModelConfig:
+    """Return the layers of an exported policy's network; ``PolicyError`` as for :func:`network_of`."""
+    with _rebuilding(policy):
+        return _layers(_weights(policy))
+
+
+@contextmanager
+def _rebuilding(policy: OnnxPolicy) -> Iterator[None]:
+    try:
+        yield
+    except (KeyError, IndexError, StopIteration, RuntimeError, ValueError) as error:
+        raise PolicyError(
+            f"{policy.path} cannot be trained or teach: its network is not built as xreset exports it ({error})."
+        ) from error
+
+
+def _layers(weights: dict[str, Tensor]) -> ModelConfig:
+    return ModelConfig(
+        pointnet=_widths(weights, "trunk.pointnet.mlp."),
+        lstm=weights["trunk.lstm.weight_hh_l0"].shape[1],
+        mlp=_widths(weights, "mlp.")[:-1],
+    )
 
 
 def _widths(weights: dict[str, Tensor], prefix: str) -> tuple[int, ...]:
@@ -73,8 +86,11 @@ def _widths(weights: dict[str, Tensor], prefix: str) -> tuple[int, ...]:
     return tuple(len(weights[name]) for name in layers)
 
 
-def _weights(graph: GraphProto) -> dict[str, Tensor]:
+def _weights(policy: OnnxPolicy) -> dict[str, Tensor]:
     """Return the weights of an exported network by the names of :class:`PointNetLstmModel`."""
+    import onnx
+
+    graph = onnx.load_model_from_string(policy.content).graph
     found = dict(_arrays(graph))
     weights = {name: value for name, value in found.items() if name.startswith(("trunk.", "mlp."))}
     for node in graph.node:
@@ -88,7 +104,9 @@ def _weights(graph: GraphProto) -> dict[str, Tensor]:
             )
             weights[bias.removesuffix("bias") + "weight"] = found[last].T
         if node.op_type == "Div" and last in found:
-            weights["trunk.normalizer._std"] = found[last] - 1e-2  # rsl-rl's eps
+            std = found[last] - 1e-2  # rsl-rl's eps
+            weights["trunk.normalizer._std"] = std
+            weights["trunk.normalizer._var"] = std.square()
         if node.op_type == "LSTM":
             input_bias, recurrent_bias = found[node.input[3]].reshape(2, -1)
             weights["trunk.lstm.bias_ih_l0"] = _reordered(input_bias)

@@ -254,7 +254,7 @@ class ToyTest(InFolder):
             ((*joint, "home"), ("0",)),
             ((*joint, "lower"), (None, 1e9, float("-inf"))),
             ((*joint, "upper"), (None, -50.0)),
-            ((*joint, "velocity"), (-1.0, "x")),
+            ((*joint, "velocity"), (-1.0, 0.0, "x")),
             (("fingertips",), (3,)),
             (("objects", "brick"), ({}, 3)),
             (("objects", "brick", "points"), ([[0, 0, float("nan")]] * 64, [])),

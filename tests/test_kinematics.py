@@ -126,6 +126,13 @@ class UrdfTest(InFolder):
         assert_array_equal(joint.axis, (1, 0, 0))
         self.assertEqual(tree.link("end").mass, 0)
 
+    def test_a_limit_of_zero_is_none(self):
+        """SolidWorks and other programs write it where nothing was stated."""
+        limit = '<limit lower="0" upper="1" effort="0" velocity="0"/></joint>'
+        joint = FIXED.format(name="j", child="end").replace("fixed", "revolute")
+        tree = load_urdf(self.urdf('<link name="end"/>', joint.replace("</joint>", limit)))
+        self.assertEqual((tree.joint("j").effort, tree.joint("j").velocity), (0.0, np.inf))
+
     def test_what_is_written_reads_back(self):
         """Also links whose names differ in a slash only, and a comment with two hyphens."""
         links = [frame("base")]

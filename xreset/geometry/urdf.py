@@ -618,7 +618,7 @@ def _joint(joint: yourdfpy.Joint) -> Joint:
     if limit := joint.limit:
         if limit.effort is not None and 0 < limit.effort < math.inf:
             limits["effort"] = float(limit.effort)
-        if limit.velocity is not None:
+        if limit.velocity is not None and limit.velocity != 0:
             limits["velocity"] = float(limit.velocity)
         if kind != "continuous":
             limits["lower"] = float(limit.lower or 0)

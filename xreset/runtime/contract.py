@@ -28,8 +28,9 @@ class LiveError(XResetError):  # pyright: ignore
 
 _FARTHEST = 100.0
 """Largest limit of a joint and coordinate of an object [rad, m]."""
+_SLOWEST = 1e-3
 _FASTEST = 1e3
-"""Largest speed limit of a joint [rad/s, m/s]."""
+"""Smallest and largest speed limit of a joint [rad/s, m/s]."""
 _LARGEST_STEP = 0.5
 """Largest move of a relative target in a control step [rad, m]."""
 
@@ -130,7 +131,7 @@ def _wrong_in_joint(name: str, joint: Any) -> Iterator[tuple[str, Any, str]]:
     yield from _outside(f"{name}.home", joint.get("home"), -_FARTHEST, _FARTHEST)
     yield from _outside(f"{name}.step", joint.get("step", 0.0), 0.0, _LARGEST_STEP)
     if joint.get("velocity") is not None:
-        yield from _outside(f"{name}.velocity", joint["velocity"], 0.0, _FASTEST)
+        yield from _outside(f"{name}.velocity", joint["velocity"], _SLOWEST, _FASTEST)
     lower: Any = joint.get("lower")
     upper: Any = joint.get("upper")
     if joint.get("type") == "continuous" and lower is None and upper is None:

@@ -162,12 +162,17 @@ def stress(
         XResetError: a property is unknown or cannot have a value; nothing was played then.
     """
     wanted = chosen_properties(properties, FAULTS if faults else SWEPT)
+    on_robot = faults or any(prop.is_fault for prop in wanted)
+    if on_robot and any(prop.in_steps for prop in wanted):
+        raise XResetError(
+            "A robot's control loop, which plays faults, has no latencies of the task. Choose action-delay in place of "
+            "action-latency and pose-delay in place of observation-latency, or try latencies without faults."
+        )
     from xreset.demos.verbs import synthesize
     from xreset.eval import experiment
     from xreset.eval.policy_spec import load_policy
     from xreset.eval.rollout import chosen_engines, load_trial
 
-    on_robot = faults or any(prop.is_fault for prop in wanted)
     spec = load_policy(policy, robot=robot)
     if on_robot:
         spec.exported()  # refuses a baseline

@@ -15,7 +15,7 @@ from tests.toy_bank import SOUP
 from tests.toy_results import swept
 from xreset import stress
 from xreset.demos.archive import write_demos
-from xreset.errors import PolicyError
+from xreset.errors import PolicyError, XResetError
 from xreset.eval.conditions import FAULTS
 from xreset.eval.effects import verdict
 from xreset.eval.policy_spec import load_policy
@@ -199,3 +199,6 @@ class CommandTest(InFolder):
             self.assertIn(words, earlier[2])
         with self.assertRaisesRegex(PolicyError, "not an exported policy"):
             stress("zero", demos, robot="openarm", faults=True)
+        late = ("action-latency", "lost-frames")
+        with self.assertRaisesRegex(XResetError, "Choose action-delay in place of action-latency"):
+            stress("soup-can", demos, properties=late, out=self.folder)

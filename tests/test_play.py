@@ -4,6 +4,7 @@ from unittest.mock import patch
 
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
+from scipy.spatial.transform import Rotation
 
 from tests.data import InFolder, refuses
 from tests.test_view import send_value
@@ -14,6 +15,7 @@ from xreset.eval.play.page import Page
 from xreset.eval.play.record import write_film, write_trace
 from xreset.eval.play.session import AWAY, Session
 from xreset.eval.results import read_traces
+from xreset.geometry.shapes import quat_of, turn_of
 from xreset.geometry.urdf import link_meshes
 from xreset.physics.plugins import backend_names, backend_status
 
@@ -45,6 +47,22 @@ class Played(InFolder):
         self.assertGreater(moment.time - session.history[0].time, 6.5)  # trainings end after 6.4 s
         self.assertLess(moment.distance, 0.05)
         self.assertFalse(session.dropped)
+
+    def test_the_object_is_at_its_goal_as_the_policy_s_task_has_it(self):
+        """This one has the origin of an object in its middle, here far from the mesh's."""
+        session = self.session
+        middle = np.full(3, 0.2)
+        with patch("xreset.eval.play.session.center", lambda _: middle):
+            session.begin()
+        for angle in (0.25, 0.27):
+            moment = session.step()
+            turn = turn_of(moment.object_quat)
+            turned = Rotation.from_rotvec((0.0, 0.0, angle)) * turn
+            shift = turn.apply(middle) - turned.apply(middle)
+            session.move_goal(moment.object_pos + shift + (0.0, 0.0, 0.019), quat_of(turned))
+            moment = session.step()
+            self.assertAlmostEqual(moment.distance, 0.019, delta=1e-3)
+            self.assertEqual(moment.success, angle < 0.26)
 
     def test_a_goal_stays_above_the_table_and_within_reach(self):
         session = self.session

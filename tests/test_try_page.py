@@ -98,15 +98,16 @@ class PhysicsTest(unittest.TestCase):
 
 
 class PolicyTest(unittest.TestCase):
-    def test_its_targets_are_those_of_xreset_play(self):
+    def test_its_targets_and_errors_are_those_of_xreset_play(self):
         installed()
         self.enterContext(one_thread())
         session = Session("many-objects", object_name=CAN)
         self.addCleanup(session.close)
         folder = Path(self.enterContext(TemporaryDirectory()))
         try_page.write_policy(folder)
-        obj = session.scene.objects[0]
-        ask(do="load", folder=str(folder), object=try_page.object_part(obj, 64))
+        obj = try_page.object_part(session.scene.objects[0], 64)
+        ask(do="load", folder=str(folder), object=obj)
+        goal = {"goalPos": session.goal_pos.tolist(), "goalQuat": session.goal_quat.tolist()}
         for _ in range(45):
             state = session.world.state
             target = ask(
@@ -119,11 +120,13 @@ class PolicyTest(unittest.TestCase):
                     "tipForce": session.world.tip_force.ravel().tolist(),
                 },
                 target=session.target.tolist(),
-                goalPos=session.goal_pos.tolist(),
-                goalQuat=session.goal_quat.tolist(),
+                **goal,
             )
             moment = session.step()
             assert_allclose(target, moment.joint_target, rtol=0, atol=1e-5)
+        place = {"objectPos": moment.object_pos.tolist(), "objectQuat": moment.object_quat.tolist()}
+        errors = ask(do="errors", scene={"object": obj}, reading=place, **goal)
+        assert_allclose(errors, (moment.distance, moment.angle, moment.success), atol=1e-6)
 
 
 class Files(http.server.SimpleHTTPRequestHandler):

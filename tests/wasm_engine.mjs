@@ -9,6 +9,7 @@ const { default: load } = await import(`${packages}/@mujoco/mujoco/mujoco.js`);
 const ort = await import(`${packages}/onnxruntime-web/dist/ort.node.min.mjs`);
 const { Physics } = await import(`${sources}/physics.js`);
 const { Policy } = await import(`${sources}/policy.js`);
+const { Session } = await import(`${sources}/session.js`);
 ort.env.wasm.numThreads = 1;
 const mujoco = await load();
 const worlds = [];
@@ -40,6 +41,10 @@ const commands = {
   },
   act({ reading, target, goalPos, goalQuat }) {
     return policy.act(reading, target, goalPos, goalQuat);
+  },
+  errors(state) {
+    const { distance, angle, isAtGoal } = Object.assign(Object.create(Session.prototype), state);
+    return [distance, angle, isAtGoal];
   },
 };
 

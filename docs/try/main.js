@@ -10,7 +10,6 @@ const LONGEST = 0.2; // a picture later than this slows the episode down instead
 const SLOW = 1 / 25; // pictures that take longer make the next ones simpler [s]
 const NOTICE_SECONDS = 4;
 const WRITE_SECONDS = 0.2; // between two updates of the text
-const AT_GOAL = 0.02; // distance that counts as reached [m], as in the reward of the training
 
 const element = (id) => document.getElementById(id);
 const status = element("status");
@@ -145,12 +144,11 @@ function write() {
   page.factor = played / seconds;
   written = before;
   played = 0;
-  const { distance, angle } = page.session;
+  const { distance, angle, isAtGoal } = page.session;
   const way = `${(100 * distance).toFixed(1)} cm and ${((180 * angle) / Math.PI).toFixed(0)}°`;
-  const isThere = distance < AT_GOAL;
-  status.textContent = isThere ? `At the goal: ${way} off.` : `${way} from the goal.`;
+  status.textContent = isAtGoal ? `At the goal: ${way} off.` : `${way} from the goal.`;
   if (paused) status.textContent = "Paused.";
-  status.classList.toggle("good", isThere && !paused);
+  status.classList.toggle("good", isAtGoal && !paused);
 }
 
 // Controls -------------------------------------------------------------------------------------------------------------

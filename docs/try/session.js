@@ -11,6 +11,8 @@ const ROBOT_FORCE = 150; // largest force of a pull at the robot [N]
 const DROPPED_SECONDS = 3; // an object that no finger touches for so long, far from its goal, counts as dropped [s]
 const DROPPED_DISTANCE = 0.05; // [m]
 const FALLEN = -0.2; // an object below this height has left the table [m]
+const GOAL_DISTANCE = 0.02; // farther objects are not at their goal, as at the end of an evaluation [m]
+const GOAL_ANGLE = Math.PI / 12; // [rad]
 
 export class Session {
   /** physics: the world. policy: a Policy. table: the entry "table" of robot.json. */
@@ -63,16 +65,23 @@ export class Session {
     if (this.hand || this.reading.tipForce.some((force) => force !== 0)) this.touched = this.time;
   }
 
-  /** Distance from the object to its goal [m]. */
+  /** Distance from the object's center, its origin in the policy's task, to the goal's [m]. */
   get distance() {
-    const { objectPos } = this.reading;
-    return Math.hypot(...objectPos.map((x, i) => x - this.goalPos[i]));
+    const { objectPos, objectQuat } = this.reading;
+    const at = rotate(objectQuat, this.scene.object.center);
+    const goal = rotate(this.goalQuat, this.scene.object.center);
+    return Math.hypot(...objectPos.map((x, i) => x + at[i] - this.goalPos[i] - goal[i]));
   }
 
   /** Angle from the object's orientation to the goal's [rad]. */
   get angle() {
     const [w, x, y, z] = product(this.goalQuat, inverse(this.reading.objectQuat));
     return 2 * Math.atan2(Math.hypot(x, y, z), Math.abs(w));
+  }
+
+  /** Whether the object is at its goal. */
+  get isAtGoal() {
+    return this.distance <= GOAL_DISTANCE && this.angle <= GOAL_ANGLE;
   }
 
   /** Whether the robot has lost the object, or never grasped it. */

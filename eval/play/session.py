@@ -82,7 +82,7 @@ class Moment:
     inputs: np.ndarray
     """[D] what the policy observed before it acted, without the object's points: see :attr:`Session.inputs`."""
     distance: float
-    """From the object to its goal [m]."""
+    """From the object's origin in the policy's task to its goal [m]."""
     angle: float
     """From the object's orientation to the goal's [rad]."""
     success: bool
@@ -274,13 +274,14 @@ class Session:
         self.history.clear()
         self.target = self.world.state["joint_target"].astype(np.float32)
         """[J] the present targets of the drives, without a pull at the robot."""
+        self._center = center(self.scene.objects[0])
         if self._controller is not None:
             self._controller.begin(
                 self._points,
                 self.goal_pos,
                 self.goal_quat,
                 self.target,
-                center(self.scene.objects[0]),
+                self._center,
             )
         self._set_gravity()
 
@@ -302,8 +303,13 @@ class Session:
         if self.away or self.world.state["object_pos"][2] < -1.0:
             self._remove_object()  # an object that has fallen off the table does not fall for ever
         state = self.world.state
-        distance = float(np.linalg.norm(state["object_pos"] - self.goal_pos))
-        turn = turn_of(state["object_quat"]).inv() * turn_of(self.goal_quat)
+        turn = turn_of(state["object_quat"])
+        goal_turn = turn_of(self.goal_quat)
+        gap = state["object_pos"] - self.goal_pos
+        if self.policy.task.object_frame == "center":
+            gap = gap + turn.apply(self._center) - goal_turn.apply(self._center)
+        distance = float(np.linalg.norm(gap))
+        angle = float((turn.inv() * goal_turn).magnitude())
         moment = Moment(
             time=self.time,
             engine=self.engine,
@@ -317,8 +323,8 @@ class Session:
             tip_force=self.world.tip_force,
             inputs=inputs,
             distance=distance,
-            angle=float(turn.magnitude()),
-            success=bool(distance < GOAL_DISTANCE and turn.magnitude() < GOAL_ANGLE),
+            angle=angle,
+            success=distance <= GOAL_DISTANCE and angle <= GOAL_ANGLE,
         )
         self.history.append(moment)
         if self.away or self._pull is not None or moment.tip_force.any():

@@ -367,7 +367,10 @@ class RobustnessTest(WithEnv):
             assert_close(now["proprio"], before["proprio"])
         env = self.make(late)
         self.play(env, 4)
+        before = [part.clone() for part in env.tracked_pose]
         env.reset(tensor([1]))
+        for part, last in zip(env.tracked_pose, before, strict=True):
+            self.assertEqual((part != last).any(dim=1).tolist(), [False, True, False])
         scaled = env.actions.absolute_action(env.backend.state().joint_pos)
         joints = env.get_observations()["proprio"][:, 3:7]
         assert_close(joints[1], scaled[1, 3:])  # the new episode's, from its first step

@@ -208,6 +208,7 @@ class ManipulationEnv:
         self._best_reach = keep("best_reach", zeros())
         """[N] smallest mean distance of the fingertips to the object in the episode [m]."""
         self._reward = keep("reward", zeros())
+        self.tracked_pose = (keep("tracked_pos", zeros(3)), keep("tracked_quat", zeros(4)))
         self._cloud = keep("cloud", zeros(*obs.cloud_shape(self.task.observation)))
         self._bad_action = keep("bad_action", no_world.clone())
         """[N] bool: an action of the episode was not finite."""
@@ -589,7 +590,8 @@ class ManipulationEnv:
         observed_pos, observed_quat = self.variation.tracker.observe(
             state.object_pos, state.object_quat, self._reset_mask, self.generator
         )
-        self.tracked_pose = (observed_pos, observed_quat)
+        for kept, value in zip(self.tracked_pose, (observed_pos, observed_quat), strict=True):
+            kept.copy_(value)
         return obs.ObservationInput(
             state=state,
             links=reading.links,

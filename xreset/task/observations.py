@@ -78,7 +78,7 @@ class ObservationInput:
         return values + std * self._normal(values)
 
     def noisy_quat(self, std: float) -> Tensor:
-        """[N, 4] observed orientation, turned about a random axis by a normal angle [rad]."""
+        """[N, 4] observed orientation, turned by normal angles about all three axes [rad]."""
         error = quat_from_axis_angle(std * self._normal(self.observed_pos))
         return quat_multiply(error, self.observed_quat)
 

@@ -226,6 +226,7 @@ def roll_out(
         env = played.env
         length = env.max_episode_length
         every = max(1, round(TRACE_INTERVAL / env.backend.scene.control_dt))
+        every = length // max(1, length // every)  # the first and another state at least
         shown = [world for world in played.fresh if played.repetition[world] == 0]
         policy.begin(env)
         states = [env.reading().state[shown].to("cpu")]

@@ -578,6 +578,16 @@ class ResultsTest(InFolder):
         trained = load_trial(policy, bank).task.termination.episode_seconds
         self.assertEqual(trained, policy.task.termination.episode_seconds)
 
+    def test_the_shortest_episodes_have_traces(self):
+        """Usually three control steps lie between two states; these episodes have one other state."""
+        policy = load_policy("zero", robot="ur7e-sharpa")
+        for steps in (1, 5):
+            options = {"episodes": 1, "episode_seconds": steps / 59, "out": self.folder}
+            evaluate(policy, toy_bank(policy.robot), engine("mujoco", workers=0), **options)
+            for trace in read_traces(self.folder, "mujoco", policy.robot.joint_names):
+                assert_allclose(trace.time, (0.0, steps / 60), atol=1e-6)
+                self.assertEqual(trace.actions("it")[1], steps)
+
     def test_episodes_of_no_length_are_refused(self):
         for seconds in (0, -1.0, 0.01, math.nan, math.inf, 1e300, "12", True):
             words = rf"^episode_seconds is {re.escape(repr(seconds))}, expected a number from 0.0167, .* to 1,000,000"

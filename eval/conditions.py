@@ -130,12 +130,12 @@ def chosen_properties(
     """
     found = []
     for text in (wanted,) if isinstance(wanted, str) else wanted:
-        name, _, values = text.partition("=")
+        name, equals, values = text.partition("=")
         name = name.replace("_", "-")
         if name not in _BY_OPTION:
             raise XResetError(f"Unknown property {name!r}. Choose from: {', '.join(_BY_OPTION)}.")
         prop = _BY_OPTION[name]
-        if values:
+        if equals:
             prop = replace(prop, values=_values(text, values, prop))
         found.append(prop)
     return tuple(found or default)

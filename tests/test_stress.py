@@ -60,6 +60,7 @@ class StressedTest(TestCase):
         for text, words in (
             ("colour", "Unknown property 'colour'. Choose from: object-friction, .*pose-delay"),
             ("effort=much", "holds values that are not numbers. Write effort=VALUE"),
+            ("effort=", "holds values that are not numbers. Write effort=VALUE"),
             ("effort=-1", "expected finite values of at least 0, other than the nominal 1"),
             ("effort=nan", "expected finite values"),
             ("pose-delay=200", "'pose-delay=200': 200 is too much. Give s, at most 2"),

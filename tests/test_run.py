@@ -79,7 +79,13 @@ class Run(InFolder, TestCase):
         demos = self.folder / "soup.npz"
         out = self.folder / "out"
         write_demos(demos, synthesize(["soup"], 1, fps=5))
-        for wrong in ("--robot nobody", "--recipe nothing", "--minutes 0", "--engine none"):
+        for wrong in (
+            "--robot nobody",
+            "--recipe nothing",
+            "--minutes 0",
+            "--engine none",
+            "--engine mujoco --meshes missing",
+        ):
             with patch.object(command, "perform") as performed:
                 refused("run", demos, "--robot openarm", wrong, "--out", out)
             self.assertFalse(performed.called or out.exists(), wrong)

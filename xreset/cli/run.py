@@ -72,7 +72,7 @@ def run(
     Raises:
         XResetError: a step fails, or a file in the folder was made from others.
     """
-    from xreset.demos.archive import read_demos
+    from xreset.demos.archive import demo_objects, read_demos
     from xreset.eval.study.steps import engines_left
     from xreset.geometry.description import load_robot
     from xreset.learning.recipes import default_config, starting_config
@@ -106,6 +106,7 @@ def run(
     motion = out / "motion.npz"
     bank = out / "resets.npz"
     _refuse_other_training(out, bank)
+    demo_objects(archive, meshes)  # cuts meshes that no command has cut before
     with claim_folder(out):  # refused if it cannot be made, or another command writes into it
         pass
     if motion.is_file():

@@ -240,7 +240,9 @@ class Pictures(WithFiles):
         film = self.folder / "view.mp4"
         with mock.patch.object(_terminal, "monotonic", count(0, 61).__next__):
             printed = succeeds("view", self.bank, "--out", film, "--sequence 0")
-        self.assertEqual(printed, f"2 frames in {film}\ndrawing: 0 %\ndrawing: 50 %\n")
+        self.assertEqual(
+            printed, f"drawing 2 frames\n2 frames in {film}\ndrawing: 0 %\ndrawing: 50 %\n"
+        )
         self.assertEqual(film.read_bytes()[4:8], b"ftyp")
         self.assertIn(
             "Frame 4 does not exist", refused("view", self.retargeted, "--out", out, "--frame 4")

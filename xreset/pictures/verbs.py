@@ -134,6 +134,7 @@ def _write_mp4(
 
     if not len(rows):
         raise XResetError("This sequence has no state to film. Choose another one with --sequence.")
+    say(f"drawing {quantity(len(rows), 'frame')}")
     draw = Drawer(shown).draw
 
     def frames() -> Iterator[np.ndarray]:

@@ -289,6 +289,13 @@ class UsageTest(TestCase):
                 # the first line of a group lists its verbs
                 self.assertLessEqual(max(map(len, lines[1:])), 80, words)
 
+    def test_help_shows_a_switch_that_is_off_without_its_opposite(self):
+        shown = set()
+        for words in (*commands(), ["train", "--help-config task.reset"]):
+            shown |= set(re.findall(r"--\S*no-[a-z-]+", run(*words, "--help")[1]))
+        self.assertEqual(shown, {"--no-video"}, "films are drawn unless the user says no")
+        self.assertIn("no none.npz", refused("demos select none.npz --no-mirror"), "still taken")
+
     def test_a_student_has_the_task_of_its_teacher_and_no_recipe(self):
         student = "train --teacher many-objects --out x --resets x.npz"
         for words, told in (

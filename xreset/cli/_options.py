@@ -16,7 +16,7 @@ from textwrap import fill
 from types import NoneType, UnionType
 from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 
-from tyro.conf import UseAppendAction, arg
+from tyro.conf import FlagCreatePairsOff, UseAppendAction, arg
 from tyro.constructors import (
     ConstructorRegistry,
     PrimitiveConstructorSpec,
@@ -27,7 +27,7 @@ from tyro.constructors import (
 
 from xreset.errors import XResetError
 from xreset.files.checks import Options, Written, check_value, marks_in, marks_of
-from xreset.files.storage import claim
+from xreset.files.storage import INVOCATION, claim
 
 _LONGEST = 1000
 """Largest number of characters of a text or a file name, because messages repeat them."""
@@ -79,8 +79,16 @@ def checked(command: Callable[..., None]) -> Callable[..., None]:
     for each in signature(command).parameters.values():
         if each.default is None:  # the text says what happens then
             run.__annotations__[each.name] = Annotated[hints[each.name], arg(help_behavior_hint="")]
+        elif each.default is False:
+            run.__annotations__[each.name] = _switch(hints[each.name])
     vars(run)["__signature__"] = signature(command)
     return run
+
+
+def _switch(hint: Any) -> Any:
+    """Return the type of a switch that is off by default. Help shows it without the flag that turns it off."""
+    is_shown = any(word == "-h" or word.startswith("--help") for word in INVOCATION)
+    return Annotated[hint, FlagCreatePairsOff] if is_shown else hint
 
 
 def refuse_repeated(command: Callable[..., None], words: Iterable[str]) -> None:
@@ -167,7 +175,8 @@ def _group(info: StructTypeInfo) -> StructConstructorSpec | None:
     fields = []
     for field in spec.fields:
         text = field.helptext() if callable(field.helptext) else field.helptext
-        fields.append(replace(field, helptext=" ".join(text.split()) if text else None))
+        kind = _switch(field.type) if field.default is False else field.type
+        fields.append(replace(field, type=kind, helptext=" ".join(text.split()) if text else None))
     return replace(spec, fields=tuple(fields))
 
 

@@ -384,6 +384,8 @@ class TrainingTest(WithBank):
             path.write_text(text)
             with refuses(self, problem, XResetError, text):
                 starting_config(str(path))
+        path.write_text("")
+        self.assertEqual(starting_config(str(path)), RECIPES["default"].config)
         path.write_text('task.reward.terms."no_such_module:term".weight = 1.0')
         with redirect_stderr(io.StringIO()) as said:
             self.assertEqual(starting_config(str(path)).task.reward.own, {})
@@ -718,6 +720,7 @@ class TrainingTest(WithBank):
                 "different meshes of 005",
                 {"goals": toy_goals(self.robot, object_sources=("abc", "stand-in"))},
             ),
+            ("bank is a goal set, .* Give it as goals", {"bank": toy_goals(self.robot)}),
             ("no state to reset to.*demo-probability 0", {"bank": empty}),
             ("reset bank for the robot 'openarm'", {"robot": "ur7e-sharpa"}),
         ):

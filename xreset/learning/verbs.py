@@ -131,8 +131,8 @@ def train(
     engine = engine or ENGINE
     device = _device(device, engine, present)
     data = training.bank_or_goals(first, goals)
-    accept = ("goals",) if first is None else ("bank", "goals")
-    load = partial(load_inputs, robot=robot, meshes=meshes, accept=accept)
+    accept = "goals" if first is None else "bank"
+    load = partial(load_inputs, robot=robot, meshes=meshes, accept=(accept,))
     inputs = load(data)
     if isinstance(inputs.data, GoalSet):
         config = from_home(config)
@@ -202,13 +202,18 @@ def _first_and_others(
 def _check_worlds(bank: Any, goals: Any, num_envs: int, config: TrainConfig) -> None:
     """Refuse, with ``XResetError``, an object of a bank, of a goal set or of both that would get none of the worlds."""
     from xreset.resets.bank import ResetBank
+    from xreset.resets.goals import GoalSet
     from xreset.resets.inputs import read_data
     from xreset.resets.schedule import shared_worlds
 
     names: dict[str, None] = {}
-    for data in (bank, goals):
-        if isinstance(data, str | Path):
-            data = read_data(Path(data), ("bank", "goals"))
+    for given in (bank, goals):
+        data = read_data(Path(given), ("bank", "goals")) if isinstance(given, str | Path) else given
+        if given is bank and isinstance(data, GoalSet):
+            raise RunError(
+                f"{given if isinstance(given, str | Path) else 'bank'} is a goal set, expected a reset bank. "
+                "Give it as goals: --goals"
+            )
         if isinstance(data, ResetBank):  # a goal set, too
             names |= dict.fromkeys(data.object_names)
     shared_worlds(tuple(names), num_envs, config.task.reset.object_share)

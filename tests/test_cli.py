@@ -270,6 +270,7 @@ class UsageTest(TestCase):
             words = run("train --help")[1]
             parts = run("train --help-config")[1]
             reset = run("train --recipe paper --help-config task.reset")[1]
+            terms = run("train --recipe any_object --help-config task.observation")[1]
         self.assertLessEqual(len(words.splitlines()), 80)
         for text in (words, reset):
             self.assertLessEqual(max(map(len, text.splitlines())), 80)
@@ -279,6 +280,9 @@ class UsageTest(TestCase):
             self.assertIn(f" {name} ", parts)
         self.assertRegex(reset, r"--config.task.reset.random-gravity[\s\S]*\(default: True\)")
         self.assertNotIn("--config.task.reward", reset)
+        shown = " ".join(terms.replace("│", " ").split())
+        self.assertIn("object_pos.noise=0.003 goal_pos rotation_to_goal.noise=0.02", shown)
+        self.assertNotIn("fixed", terms)
         refusal = run("train --help-config tusk")[2]
         self.assertIn("no part 'tusk'. Choose from: all, task, task.action", refusal)
 

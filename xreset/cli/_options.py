@@ -231,6 +231,30 @@ def _optional(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
     )
 
 
+@RULES.primitive_rule
+def _terms(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
+    """Show a table of terms, which flags of single terms have changed already (:mod:`xreset.cli._terms`)."""
+    if not isinstance(info.type, type) or not issubclass(info.type, dict):
+        return None
+
+    def read(words: list[str]) -> Any:
+        raise ValueError(f"found {' '.join(words)!r}, expected .NAME.PARAMETER VALUE")
+
+    def shown(table: Mapping[str, Mapping[str, Any]]) -> list[str]:
+        words = []
+        for name, term in table.items():
+            words += [f"{name}.{key}={value}" for key, value in term.items()] or [name]
+        return words
+
+    return PrimitiveConstructorSpec(
+        nargs="*",
+        metavar=".NAME.PARAMETER VALUE",
+        instance_from_str=read,
+        is_instance=lambda value: isinstance(value, dict),
+        str_from_instance=shown,
+    )
+
+
 def _options_of(given: Mapping[str, Any], hints: Mapping[str, Any]) -> Iterator[_Option]:
     """Yield the options of a command; those of a group of options one by one."""
     for name, value in given.items():

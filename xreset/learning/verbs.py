@@ -83,7 +83,8 @@ def train(
             deviation of the actions and the learning rate. Or an exported policy (.onnx), or the name of one that ships
             with xreset: it has no critic, so a new one learns alone in the first iterations.
         teacher: run folder, exported policy (.onnx), or name of a policy that ships with xreset: a student learns its
-            actions, in its task, from what cameras show (DAgger). Images and their timing: --help-config task.vision.
+            actions, in its task, from what cameras show (DAgger). Options of the images: --teacher NAME
+            --help-config task.vision.
         cameras: camera of a student: front, side, or wrist, or two of them; default: front.
         wandb: project of Weights & Biases to which learning curves are sent as well. Needs the package wandb, and a
             login. Its variables, such as WANDB_RUN_GROUP and WANDB_MODE=offline, say the rest.

@@ -86,6 +86,13 @@ class Right(TestCase):
         with patch("xreset.demos.examine._SMALL_BATCH", 1):
             self.assertEqual(examine(wrong, objects), alone)
 
+    def test_a_hand_that_jumps_for_a_frame_has_the_clock_of_its_object(self):
+        demos = synthesize(["soup", "banana"], 4, seed=0)
+        points = demos.hand_keypoints.copy()
+        points[demos.frame_offsets[:-1] + 45, :, 0] += 0.3
+        found = examine(replace(demos, hand_keypoints=points), surfaces(demo_objects(demos)))
+        self.assertEqual([each.name for each in found], ["jumps"])
+
     def test_recorded_demonstrations(self):
         """Of 600 sequences, some objects stand on others, and one hand is never seen while its object moves."""
         for name in ARCHIVES:

@@ -225,7 +225,11 @@ def _findings(r: Recording) -> Iterator[Finding]:
         yield finding
         if finding.wrong:
             return
-    yield from _of_place(r)
+    jumps = _hand_jumps(r)
+    points = r.points.copy()
+    points[jumps] = np.nan
+    # such a frame makes the hand fast, for which clocks that differ would be blamed
+    yield from _of_place(replace(r, points=points) if len(jumps) else r)
     yield from _of_motion(r)
 
 
@@ -437,7 +441,7 @@ def _doubts_of_hand(r: Recording, bones: np.ndarray) -> Iterator[Finding]:
             "Are they MANO's root, in the table frame, and quaternions (w, x, y, z)? Check those of the objects too.",
         )
     wrist = r.points[:, 0]
-    jumps = np.flatnonzero(_returns(wrist) > _RETURN) + 1
+    jumps = _hand_jumps(r)
     if len(jumps):
         yield _doubt(
             "jumps",
@@ -561,6 +565,11 @@ def _returns(path: np.ndarray) -> np.ndarray:
     step = np.linalg.norm(np.diff(path, axis=0), axis=1)
     across = np.linalg.norm(path[2:] - path[:-2], axis=1)
     return np.minimum(step[1:], step[:-1]) - across
+
+
+def _hand_jumps(r: Recording) -> np.ndarray:
+    """Return the frames in which the hand leaves its path and comes back."""
+    return np.flatnonzero(_returns(r.points[:, 0]) > _RETURN) + 1
 
 
 def _lost_frame(r: Recording) -> int:

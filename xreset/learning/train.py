@@ -25,7 +25,7 @@ from xreset.env.manipulation import make_env
 from xreset.env.several import SeveralEnvs
 from xreset.errors import PolicyError, RunError, Stopped, XResetError
 from xreset.files.storage import claim_folder, file_hash, write_whole
-from xreset.files.text import shown
+from xreset.files.text import quantity, shown
 from xreset.learning.config import TrainConfig
 from xreset.learning.distributed import Processes, leave
 from xreset.learning.export import export_checkpoint
@@ -451,7 +451,7 @@ def run_training(
     if processes.is_main:
         policy = out / "policy.onnx"
         export_checkpoint(latest_checkpoint(out), policy)
-        print(f"policy after {runner.iteration} iterations in {policy}", flush=True)
+        print(f"policy after {quantity(runner.iteration, 'iteration')} in {policy}", flush=True)
     if stopped_by is not None:
         raise Stopped(stopped_by)
 

@@ -397,9 +397,8 @@ class PipelineTest(InOneFolder):
         self.assertIn(words, said)
         said = self.commanded("left", "ur7e-sharpa", "--trust-recordings")
         self.assertIn(words, said)
-        self.assertIn(
-            "1 of 1 sequences are of left hands, but the robot's hand is a right one", said
-        )
+        self.assertIn("1 of 1 sequences are of left hands, but the robot's hand is a right", said)
+        self.assertIn("select --side right; --mirror makes right hands of the others", said)
         self.assertIn(words, stated_doubts(out)[0])
 
     def test_the_file_says_what_the_robot_does(self):

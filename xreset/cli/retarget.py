@@ -25,13 +25,14 @@ def _show(motion: Retargeted, options: Mapping[str, Any]) -> None:
     side = hand_side(load_robot(options["robot"]))
     others = np.count_nonzero(motion.hand_side != side)
     if side and others:
-        other, remedy = ("left", "--mirror") if side == "right" else ("right", "--side left")
-        show_notes(
-            [
-                f"{others} of {len(motion.hand_side)} sequences are of {other} hands, but the robot's hand is a {side} "
-                f"one. Use xreset demos select {remedy}"
-            ]
+        other = "left" if side == "right" else "right"
+        note = (
+            f"{others} of {len(motion.hand_side)} sequences are of {other} hands, but the robot's hand is a {side} one. "
+            f"Use xreset demos select --side {side}"
         )
+        if side == "right":
+            note += "; --mirror makes right hands of the others"
+        show_notes([note])
     show_accounts(
         [row.without("not annotated") for row in motion.accounts()],
         f"annotated frames retargeted to {motion.robot}: those that are valid",

@@ -27,8 +27,8 @@ def _show(motion: Retargeted, options: Mapping[str, Any]) -> None:
     if side and others:
         other = "left" if side == "right" else "right"
         note = (
-            f"{others} of {len(motion.hand_side)} sequences are of {other} hands, but the robot's hand is a {side} one. "
-            f"Use xreset demos select --side {side}"
+            f"{others} of {len(motion.hand_side)} sequences are of {other} hands, but the robot's hand is a {side} "
+            f"one. Use xreset demos select --side {side}"
         )
         if side == "right":
             note += "; --mirror makes right hands of the others"

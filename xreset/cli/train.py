@@ -36,7 +36,7 @@ def command_for(arguments: list[str]) -> Callable[..., None]:
     continues = not given.resets and not given.goals
     if continues and given.help_config is None:
         config = TrainConfig()
-    elif given.teacher and not recipe and not given.weights:
+    elif given.teacher and not recipe:
         from xreset.learning.train import config_of_student
 
         config = config_of_student(given.teacher, given.camera or "front")

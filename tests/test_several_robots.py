@@ -282,14 +282,14 @@ class TrainingTest(InOneFolder):
                 self.banks[1],
                 out=self.folder / "tuned",
                 weights=self.out,
-                recipe=self.out,
                 iterations=1,
                 **OPTIONS,
             )
         info = read_run(run)
         self.assertEqual((info.robot, info.config.task.joint_slots), ("ur7e-robotiq", (7, 1)))
         with self.assertRaisesRegex(PolicyError, "Start from its configuration"):
-            train(self.banks[1], out=self.folder / "wrong", weights=self.out, **OPTIONS)
+            out = self.folder / "wrong"
+            train(self.banks[1], out=out, weights=self.out, recipe="default", **OPTIONS)
 
     def test_banks_that_do_not_go_together(self):
         out = self.folder / "refused"

@@ -450,7 +450,7 @@ class TrainingTest(WithBank):
         for arguments, problem in (
             (
                 "--recipe nothing",
-                "no recipe, no file and no run folder 'nothing'. Recipes: default, .*; paper, the paper's tables",
+                "no recipe, file, run folder or policy 'nothing'. Recipes: default, .*; paper, the paper's tables",
             ),
             (f"--recipe {self.folder}", "is not a run folder"),
         ):

@@ -94,7 +94,7 @@ def refuse_options(out: Path, given: Mapping[str, Any], config: TrainConfig | No
         if value is not None:
             raise RunError(
                 f"Without a reset bank or a goal set, {out} continues as it was started. Omit {name}, give the whole "
-                f"command again, or start another run with this run's networks: --weights {out} --recipe {out}"
+                f"command again, or start another run with this run's networks: --weights {out}"
             )
 
 

@@ -165,8 +165,8 @@ def resume(
     if expected != dict(own or {}):
         fix = f"add {own_terms_flags(expected)} (in Python: to config)" if expected else "omit them"
         raise RunError(
-            f"{out} was trained with {len(expected)} reward terms of your own, but {len(own or {})} were named. "
-            f"A run folder must not decide which code is imported. If you trust this code, {fix}."
+            f"{out} was trained with {quantity(len(expected), 'reward term')} of your own, but {len(own or {})} were"
+            f" named. A run folder must not decide which code is imported. If you trust this code, {fix}."
         )
     if iterations is not None or minutes is not None:
         info = replace(info, iterations=iterations, minutes=minutes)

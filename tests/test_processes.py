@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from unittest import TestCase
@@ -62,6 +63,12 @@ class ProcessesTest(TestCase):
         jobs, processes = zip(*in_processes(process_of, range(6)), strict=True)
         self.assertEqual(jobs, tuple(range(6)))
         self.assertNotIn(os.getpid(), processes)
+
+    def test_a_process_that_ends_while_jobs_come_is_no_news(self):
+        list(in_processes(process_of, range(2)))
+        with warnings.catch_warnings(record=True) as said:
+            warnings.warn("A worker stopped while some jobs were given", UserWarning, stacklevel=1)
+        self.assertEqual(said, [])
 
     def test_one_job_stays_in_this_process(self):
         self.assertEqual(list(in_processes(process_of, [7])), [(7, os.getpid())])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
@@ -53,6 +54,8 @@ def in_processes(function: Callable[[_Job], _Result], jobs: Sequence[_Job]) -> I
     if count <= 1:
         yield from map(function, jobs)
         return
+    # a process that was idle ends while jobs come, on a busy machine: another one starts
+    warnings.filterwarnings("ignore", "A worker stopped while some jobs", UserWarning)
     with joblib.parallel_config(backend="loky", inner_max_num_threads=1, idle_worker_timeout=_IDLE):
         pool = joblib.Parallel(n_jobs=count, return_as="generator")
         with _quiet_tracker():

@@ -442,6 +442,11 @@ def run_training(
             runner.load_checkpoint(newest)
         elif learns_on:
             runner.load_policy(read_policy(str(info.weights)))
+            if processes.is_main:
+                print(
+                    f"{info.weights} has no critic: a new one learns alone in the first {CRITIC_ITERATIONS} iterations",
+                    flush=True,
+                )
         elif info.weights is not None:
             runner.load_networks(Path(info.weights))
         runner.alg.critic_only = learns_on and runner.iteration < CRITIC_ITERATIONS

@@ -118,7 +118,7 @@ def decompose(mesh: trimesh.Trimesh, settings: Settings = Settings()) -> Pieces:
     """Return convex pieces that together have the mesh's shape.
 
     Args:
-        mesh: closed or not (:func:`as_solid`).
+        mesh: closed or not (:func:`as_solid`); its metadata may have the object's ``name``, for a message.
 
     Raises:
         ObjectError: the mesh is concave and manifold3d, which cuts it, is not installed; or the mesh encloses nothing,
@@ -146,7 +146,7 @@ def decompose(mesh: trimesh.Trimesh, settings: Settings = Settings()) -> Pieces:
             com, inertia = mass_properties(*mesh_arrays(solid), 1.0)
     else:
         whole = as_solid(mesh)
-        cutter = _Cutter(whole, settings)
+        cutter = _Cutter(whole, settings, mesh.metadata.get("name", "the mesh"))
         shapes, deviation = cutter.shapes()
         finished = cutter.effort > 0
         surface = cutter.surface
@@ -396,7 +396,7 @@ class _Cutter:
     """One decomposition of a solid. Pieces are cut from a copy with fewer triangles; in the end they are measured
     against the whole solid."""
 
-    def __init__(self, whole: Manifold, settings: Settings) -> None:
+    def __init__(self, whole: Manifold, settings: Settings, name: str) -> None:
         """Prepare a solid; ``ObjectError`` if it consists of specks."""
         self.surface = _Solid(whole)
         self.effort = settings.effort
@@ -409,6 +409,7 @@ class _Cutter:
             )
         self._solid = _Solid(simple)
         self._settings = settings
+        self._name = name
 
     def shapes(self) -> tuple[list[Shape], float]:
         """Return the pieces and their largest deviation [m]."""
@@ -431,7 +432,7 @@ class _Cutter:
         before = self.effort
         self.effort -= sum(solid.num_tri() for solid in solids)
         if self.effort < _LONG * self._settings.effort <= before:
-            _log.warning("the mesh is cut into convex pieces, which takes up to a minute")
+            _log.warning("%s is cut into convex pieces, which takes up to a minute", self._name)
 
     def _cut_worst(
         self,

@@ -114,6 +114,7 @@ def import_with_notes(path: str | Path, name: str) -> Import:
         settings = Settings()
         if own.tolerance is not None:
             settings = Settings(hull_depth=0.0, tolerance=own.tolerance)
+        mesh.metadata["name"] = name
         pieces = cached_pieces(mesh, cut, settings)
         if known is None:
             _check_density(mesh, _density(own) * pieces.volume)

@@ -22,6 +22,7 @@ from xreset.demos.archive import SIDES, Demos, merge_demos, one_sequence
 from xreset.demos.grasp import Contacts, Grasp, Solid, fit_hand, handedness, plan_contacts
 from xreset.errors import DemoError
 from xreset.files.checks import first_repeated
+from xreset.files.processes import in_processes
 from xreset.files.progress import Progress
 from xreset.geometry.shapes import turn_of
 from xreset.objects.catalogue import load_objects
@@ -65,6 +66,10 @@ GOAL_ROLL = (np.radians(-85.0), np.radians(90.0))
 """Angle of the palm at the goal about the fingers: at -90 degrees it faces down, at 90 up, and at 0 a right hand's
 faces +x. 90 is the 95th percentile of turns of over 120 degrees (66 that of all)."""
 
+_BATCH = 10
+"""Sequences that a process makes before it reports: a few seconds, or a minute with a complicated mesh."""
+_FEW = 16
+"""Sequences up to which other processes take longer to start than they save."""
 _CLEAR = 0.001
 """A path is good if no keypoint comes nearer than this to object or table [m]; a fingertip in contact is at about 2
 mm."""
@@ -94,18 +99,41 @@ def synthetic_demos(
     given = [spec.name for spec in specs]
     if (i := first_repeated(given)) is not None:
         raise DemoError(f"The object {given[i]} is given twice. Name each object once.")
-    parts = []
+    batches = []
     for side in sides:
         for spec in specs:
-            starts = _Starts(spec, side)
-            for index in range(per_object):
-                name = f"{SUBJECT}/{spec.name}_{side}_{seed}_{index:03d}"
-                rng = np.random.default_rng(
-                    [seed, index, zlib.crc32(spec.name.encode()), side == "left"]
-                )
-                parts.append(_sequence(spec, starts, name, side, fps, rng))
-                progress(len(parts), len(specs) * per_object * len(sides))
+            for first in range(0, per_object, _BATCH):
+                indices = range(first, min(first + _BATCH, per_object))
+                batches.append(_Batch(spec, side, seed, fps, indices))
+    in_all = len(specs) * per_object * len(sides)
+    compute = in_processes if in_all > _FEW else map
+    parts = []
+    for sequences in compute(_sequences, batches):
+        parts += sequences
+        progress(len(parts), in_all)
     return merge_demos(parts)
+
+
+class _Batch(NamedTuple):
+    """Sequences of one object and one hand that a process makes."""
+
+    obj: ObjectSpec
+    side: str
+    seed: int
+    fps: float
+    indices: range
+
+
+def _sequences(batch: _Batch) -> list[Demos]:
+    """Make the sequences of a batch; a function of a module, for other processes."""
+    obj, side, seed, fps, indices = batch
+    starts = _Starts(obj, side)
+    parts = []
+    for index in indices:
+        name = f"{SUBJECT}/{obj.name}_{side}_{seed}_{index:03d}"
+        rng = np.random.default_rng([seed, index, zlib.crc32(obj.name.encode()), side == "left"])
+        parts.append(_sequence(obj, starts, name, side, fps, rng))
+    return parts
 
 
 def _sequence(

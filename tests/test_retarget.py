@@ -155,12 +155,19 @@ class HandTest(TestCase):
         self.assertLess(quat_angle(found.root_quat, self.motion.root_quat).max(), 5e-3)
 
     def test_each_sequence_is_retargeted_independently(self):
-        targets = self.targets(object_pos=self.keypoints[:, :, self.tip] + 0.01)
+        place = self.keypoints[:, :, self.tip] + 0.01
+        targets = self.targets(object_pos=place)
         together = retarget_hand(self.model, targets).joints
         for order in ([2, 0, 1], [1]):
             assert_close(
                 retarget_hand(self.model, targets[order]).joints, together[order], atol=1e-9, rtol=0
             )
+        # a batch pads shorter sequences with frames that are not annotated
+        short = self.targets(keypoints=self.keypoints[[1], :8], object_pos=place[[1], :8])
+        targets.annotated[1, 8:] = False
+        padded = retarget_hand(self.model, targets).joints[1]
+        assert_close(padded[:8], retarget_hand(self.model, short).joints[0], atol=1e-9, rtol=0)
+        assert_close(padded[8:], padded[7].expand(4, -1))
 
     def test_joints_do_not_jump(self):
         """Keypoints that jump to another posture in one frame: the wall spreads the change over several."""

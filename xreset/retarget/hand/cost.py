@@ -60,8 +60,12 @@ def system(
     weight[joints : joints + 3] /= config.length_scale**2
     limit = torch.full_like(weight, float("inf"))
     limit[:joints] = config.jump_limit
+    inside = targets.inside
+    apart = ~(inside[:, 1:] & inside[:, :-1])
     change = change_cost(changes, weight, limit, config.jump_weight)
+    change = change.map(lambda x: x.masked_fill(apart.view(*apart.shape, *[1] * (x.dim() - 2)), 0))
     diagonal = single.curvature.diagonal(dim1=-2, dim2=-1)
+    diagonal[~inside] = 1.0  # these frames do not move
     diagonal[:, 1:] += change.curvature
     diagonal[:, :-1] += change.curvature
     single.gradient[:, 1:] += change.gradient

@@ -52,6 +52,12 @@ class HandTargets(Tensors):
     fields: DistanceFields
     """Signed distances to the objects' surfaces."""
 
+    @property
+    def inside(self) -> Tensor:
+        """[S, T] bool: from the first annotated frame to the last."""
+        seen = self.annotated.int()
+        return (seen.cumsum(1) > 0) & (seen.flip(1).cumsum(1) > 0).flip(1)
+
 
 @dataclass(frozen=True)
 class HandState(Tensors):

@@ -55,8 +55,9 @@ def retarget_hand(
     config = config or HandWeights()
     device = targets.keypoints.device
     targets = targets.to(model.device)
-    human = _gaps_filled(targets)
-    root_pos, root_quat = _align_root(model, human)
+    rows = torch.arange(len(targets.annotated), device=model.device)[:, None]
+    nearest = _nearest_annotated(targets.annotated)
+    root_pos, root_quat = _align_root(model, targets.keypoints[rows, nearest])
     joints = model.kinematics.clamp(model.home).expand(*targets.annotated.shape, -1)
     state = HandState(joints, root_pos, root_quat)
     if config.clearance_weight:
@@ -64,7 +65,9 @@ def retarget_hand(
             weight = share * config.clearance_weight
             stage = replace(config, clearance_weight=weight, iterations=_GROWTH_STEPS)
             state = _minimize(model, targets, stage, state)
-    return _minimize(model, targets, config, state).to(device)
+    state = _minimize(model, targets, config, state)
+    time = torch.arange(nearest.shape[1], device=model.device)
+    return state[rows, torch.where(targets.inside, time, nearest)].to(device)
 
 
 def _minimize(
@@ -100,20 +103,17 @@ def _align_root(model: HandModel, human: Tensor) -> tuple[Tensor, Tensor]:
     return pos, matrix_to_quat(rot)
 
 
-def _gaps_filled(targets: HandTargets) -> Tensor:
-    """[S, T, P, 3] human keypoints; frames that are not annotated have those of the nearest annotated frame.
+def _nearest_annotated(annotated: Tensor) -> Tensor:
+    """[S, T] the annotated frame that is nearest to each frame.
 
     Raises:
         ValueError: a sequence has no annotated frame.
     """
-    annotated = targets.annotated
     if not annotated.any(dim=1).all():
         raise ValueError("A sequence has no annotated frame. Select sequences that have one.")
     time = torch.arange(annotated.shape[1], device=annotated.device)
     distance = (time[:, None] - time).abs().expand(len(annotated), -1, -1)
-    nearest = distance.masked_fill(~annotated[:, None, :], len(time) * 2).argmin(dim=-1)
-    rows = torch.arange(len(annotated), device=annotated.device)[:, None]
-    return targets.keypoints[rows, nearest]
+    return distance.masked_fill(~annotated[:, None, :], len(time) * 2).argmin(dim=-1)
 
 
 def _moved(model: HandModel, state: HandState, step: Tensor) -> HandState:

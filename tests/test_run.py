@@ -82,6 +82,7 @@ class Run(InFolder, TestCase):
         for wrong in (
             "--robot nobody",
             "--recipe nothing",
+            "--weights many-objects",
             "--minutes 0",
             "--engine none",
             "--engine mujoco --meshes missing",

@@ -88,6 +88,10 @@ def run(
     spec = load_robot(robot)
     config = starting_config(recipe) if recipe else default_config(weights)[1]
     task = config.task
+    if weights is not None:
+        from xreset.learning.train import networks_to_start_with
+
+        networks_to_start_with(weights, [spec], config)
     shared_worlds(archive.object_names, num_envs, task.reset.object_share)
     named = [engine] if isinstance(engine, str) else engine
     engines = [each.name for each in quick_engines(named, "cpu")]

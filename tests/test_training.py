@@ -727,6 +727,8 @@ class TrainingTest(WithBank):
             with refuses(self, words, XResetError):
                 self.train("refused", **options)
             self.assertEqual(list(self.folder.glob("refused/*.npz")), [], words)
+        with patch.dict("sys.modules", {"wandb": None}), refuses(self, r"\[wandb\]", XResetError):
+            self.train("refused", wandb="project")
         with (
             patch(
                 "xreset.backends.mujoco.MujocoBackend.engine_version", side_effect=RunError("gone")

@@ -75,10 +75,10 @@ def expected(training: Training) -> list[str]:
         found.append(_IK)
     lift = training.lift
     if lift.iteration and not lift.passed:
+        length = f"{quantity(lift.iteration, 'iteration')} ({lift.minutes:.2g} min)"
         found.append(
-            f"No object at its goal is expected: in {lift.iteration:,} iterations ({lift.minutes:.2g} min), the"
-            " training has not once brought an object to its goal from home. Most trainings need minutes on a GPU for"
-            " that."
+            f"No object at its goal is expected: in {length}, the training has not once brought an object to its goal"
+            " from home. Most trainings need minutes on a GPU for that."
         )
     return found
 

@@ -23,6 +23,13 @@ _LINE_SECONDS = 10.0
 """Least time between two lines [s]."""
 
 
+def wandb_init() -> Any:
+    """Return the function that starts a run of Weights & Biases; ``XResetError`` if the package is missing."""
+    with needs("wandb, which sends learning curves,", "wandb"):
+        from wandb import init  # pyright: ignore[reportMissingImports]
+    return init
+
+
 class TrainingLog:
     """Sums the numbers of an iteration on the device, so that nothing waits for a GPU. Then it writes a line and the
     curves."""
@@ -54,9 +61,7 @@ class TrainingLog:
         """
         self._online = None
         if wandb is not None:
-            with needs("wandb, which sends learning curves,", "wandb"):
-                from wandb import init  # pyright: ignore[reportMissingImports]
-            self._online = init(
+            self._online = wandb_init()(
                 project=wandb,
                 name=os.environ.get("WANDB_NAME", folder.name),
                 dir=str(folder),

@@ -126,7 +126,11 @@ def train(
     for source in (first, *others):
         _check_worlds(source, goals, num_envs // (1 + len(others)), config)
     from xreset.learning import train as training
+    from xreset.learning.log import wandb_init
     from xreset.policy.onnx_policy import policy_contract
+
+    if wandb is not None:
+        wandb_init()  # fails where the package is missing
 
     present = read_run(out) if checkpoints(out) else None
     engine = engine or ENGINE

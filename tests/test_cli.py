@@ -194,6 +194,18 @@ class UsageTest(TestCase):
                 r"--out is d\.npz, which the command reads",
                 "demos select c.npz d.npz --out ./d.npz",
             ),
+            (r"--out is empty\. Is a variable of the shell not set", "run d.npz --out="),
+            (r"--host is empty\.", "view d.npz --host ''"),
+            (r"An argument is empty\.", "policies ''"),
+            (
+                r"--objects has no value\. Give one or several, or omit it",
+                "demos select d.npz --objects",
+            ),
+            (
+                r"--scale is inf, expected a finite number",
+                "objects import x.stl --out o --scale inf",
+            ),
+            (r"Give one archive, or several", "demos select"),
             (
                 r"--out is e\.npz, which is --rest as well",
                 "demos select d.npz --share 0.5 --out e.npz --rest ./e.npz",

@@ -122,13 +122,20 @@ def perform(argv: list[str]) -> None:
     module = import_module(f"xreset.cli.{name}")
     import tyro
 
-    from xreset.cli._options import RULES, checked, description, fitted, refuse_repeated
+    from xreset.cli._options import (
+        RULES,
+        checked,
+        description,
+        fitted,
+        refuse_empty,
+        refuse_unclear,
+    )
     from xreset.files import storage
 
     storage.INVOCATION[:] = argv
 
     def call(function: Callable[..., None], words: list[str], *verb: str) -> None:
-        refuse_repeated(function, words)
+        refuse_unclear(function, words)
         tyro.cli(
             checked(function),
             args=words,
@@ -137,6 +144,7 @@ def perform(argv: list[str]) -> None:
             registry=RULES,
         )
 
+    refuse_empty(arguments)
     command = module.command_for(arguments) if hasattr(module, "command_for") else module.COMMAND
     if arguments[:1] == ["list"]:  # as in earlier versions
         arguments = arguments[1:]

@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, is_dataclass, replace
 from inspect import cleandoc, signature
+from itertools import pairwise
 from numbers import Integral, Real
 from pathlib import Path
 from shutil import get_terminal_size
@@ -91,15 +92,28 @@ def _switch(hint: Any) -> Any:
     return Annotated[hint, FlagCreatePairsOff] if is_shown else hint
 
 
-def refuse_repeated(command: Callable[..., None], words: Iterable[str]) -> None:
+def refuse_empty(words: Iterable[str]) -> None:
+    """Refuse, with ``XResetError``, an empty argument, which would be the current folder as a path, and every
+    address as a host."""
+    option = "An argument"
+    for word in words:
+        flag, equals, value = word.partition("=")
+        is_flag = flag.startswith("--")
+        if not word or (is_flag and equals and not value):
+            name = flag or option
+            raise XResetError(f"{name} is empty. Is a variable of the shell not set?")
+        option = flag if is_flag else "An argument"
+
+
+def refuse_unclear(command: Callable[..., None], words: Sequence[str]) -> None:
     """Refuse, with ``XResetError``, an option that takes several values or names an output, and is given again, because
-    only the last one would count."""
+    only the last one would count; and an option of several values that has none, because it would count as omitted."""
     flags = Counter(
         word.partition("=")[0].replace("_", "-") for word in words if word.startswith("--")
     )
     again = [flag for flag, count in flags.items() if count > 1]
-    if not again:
-        return
+    followed = pairwise([*words, "--"])
+    bare = [flag for flag, following in followed if following.startswith("--")]
     for name, hint in get_type_hints(command, include_extras=True).items():
         flag = f"--{name.replace('_', '-')}"
         if flag in again and _names_output(marks_in(hint)):
@@ -107,6 +121,8 @@ def refuse_repeated(command: Callable[..., None], words: Iterable[str]) -> None:
                 f"{flag} is given more than once. Give the command once for each file."
             )
         for flag in _flags_of_lists(f"--{name}", hint):
+            if flag in bare and not flag.startswith("--config."):  # there, none is a value
+                raise XResetError(f"{flag} has no value. Give one or several, or omit it.")
             if flag in again:
                 raise XResetError(
                     f"{flag} is given more than once. Give all of its values together: {flag} A B"
@@ -273,8 +289,8 @@ def _check(option: _Option) -> None:
             raise XResetError(
                 f"{option.flag} has {len(str(text))} characters, expected at most {_LONGEST}."
             )
-    if isinstance(option.value, float) and math.isnan(option.value):
-        raise XResetError(f"{option.flag} is not a number.")
+    if isinstance(option.value, float) and not math.isfinite(option.value):
+        raise XResetError(f"{option.flag} is {option.value}, expected a finite number.")
 
 
 def _check_overwriting(options: list[_Option]) -> None:

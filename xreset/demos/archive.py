@@ -308,7 +308,7 @@ def merge_demos(parts: Sequence[Demos]) -> Demos:
         DemoError: there is nothing to join, the parts differ in their frame rates, or two sequences have the same name.
     """
     if not parts:
-        raise DemoError("There are no demonstrations to join.")
+        raise DemoError("There are no demonstrations to join. Give one archive, or several.")
     rates = sorted({round(float(part.fps), 3) for part in parts})
     if rates[-1] > (1 + _SAME_RATE) * rates[0]:
         raise DemoError(

@@ -128,7 +128,7 @@ def chosen_properties(
     Raises:
         XResetError: a property is unknown, or a value is impossible.
     """
-    found = []
+    found: dict[str, Property] = {}
     for text in (wanted,) if isinstance(wanted, str) else wanted:
         name, equals, values = text.partition("=")
         name = name.replace("_", "-")
@@ -137,8 +137,10 @@ def chosen_properties(
         prop = _BY_OPTION[name]
         if equals:
             prop = replace(prop, values=_values(text, values, prop))
-        found.append(prop)
-    return tuple(found or default)
+        if name in found:  # the values of both
+            prop = replace(prop, values=tuple(sorted({*prop.values, *found[name].values})))
+        found[name] = prop
+    return tuple(found.values()) or tuple(default)
 
 
 def _values(text: str, values: str, prop: Property) -> tuple[float, ...]:

@@ -135,6 +135,7 @@ class Episodes(Case):
                 "different rates.*20 in.*10 in",
             ),
             ([self.folder / "nowhere"], RunError, "The folder .*nowhere does not exist"),
+            ([self.folder, self.folder / "eval"], RunError, "eval are given twice"),
         ):
             with refuses(self, words, error):
                 read_recorded(folders)

@@ -11,7 +11,7 @@ from tests.data import InFolder, InOneFolder, refuses
 from tests.toy_bank import SOUP, in_this_process
 from tests.toy_goals import toy_goals
 from xreset import GoalConfig, load_object, load_policy, load_robot
-from xreset.errors import DemoError, FileFormatError, GoalError
+from xreset.errors import DemoError, FileFormatError, GoalError, ObjectError
 from xreset.eval.rollout import engine, load_trial, roll_out
 from xreset.files.records import npz_schema
 from xreset.geometry.shapes import turn_of
@@ -91,11 +91,13 @@ class MadeTest(InOneFolder):
                 refuses(self, message, error),
             ):
                 make_goals(["banana"], robot=self.robot, **options)
+        with self.assertRaisesRegex(ObjectError, "011_banana is given twice"):
+            make_goals(["banana", "011_banana"], robot=self.robot)
 
     def test_the_command_draws_what_its_options_say(self):
         pose = (0.6, 0.25, 0.3, 1, 0, 0, 0)
         file = self.folder / "goals.npz"
-        options = ("--family yaw --per-family 2 --seed 3 --pose", *pose)
+        options = ("--family yaw --family yaw --per-family 2 --seed 3 --pose", *pose)
         said = succeeds("goals banana --robot ur7e-sharpa --out", file, *options)
         self.assertIn("3 goals of 1 object (2 yaw, 1 own)", said)
         config = GoalConfig(per_family=2, seed=3)

@@ -55,6 +55,8 @@ class StressedTest(TestCase):
         )
         self.assertEqual(chosen_properties("arm-stiffness=2,0.5"), (prop,), "one")
         self.assertEqual(chosen_properties([]), SWEPT)
+        twice = chosen_properties(["arm-stiffness=2", "arm-stiffness=0.5,2"])
+        self.assertEqual(twice, (prop,), "a value that is played twice cannot be compared")
 
     def test_refusals(self):
         for text, words in (

@@ -18,7 +18,7 @@ from xreset.errors import RunError
 from xreset.eval.report.read import results_in
 from xreset.eval.results import Trace, read_evaluation, read_traces, recorded
 from xreset.eval.stats import Table
-from xreset.files.checks import frozen
+from xreset.files.checks import first_repeated, frozen
 from xreset.files.records import write_npz
 from xreset.files.storage import file_hash
 from xreset.files.text import short_name, shown
@@ -99,8 +99,10 @@ def read_recorded(
     inputs: dict[str, str] = {}
     every = [folders] if isinstance(folders, str | Path) else folders
     wanted = [engines] if isinstance(engines, str) else engines
-    for folder in every:
-        results = results_in(Path(folder))
+    places = [results_in(Path(folder)) for folder in every]
+    if (i := first_repeated([place.resolve() for place in places])) is not None:
+        raise RunError(f"The results in {places[i]} are given twice. Give each folder once.")
+    for results in places:
         evaluation = read_evaluation(results)
         for result in evaluation:
             if wanted and result.engine not in wanted:

@@ -21,7 +21,6 @@ from xreset.demos import hand
 from xreset.demos.archive import SIDES, Demos, merge_demos, one_sequence
 from xreset.demos.grasp import Contacts, Grasp, Solid, fit_hand, handedness, plan_contacts
 from xreset.errors import DemoError
-from xreset.files.checks import first_repeated
 from xreset.files.processes import in_processes
 from xreset.files.progress import Progress
 from xreset.geometry.shapes import turn_of
@@ -96,9 +95,6 @@ def synthetic_demos(
     if unknown := sorted(set(sides) - set(SIDES)):
         raise DemoError(f"side is {unknown[0]!r}, expected 'right', 'left' or 'both'.")
     specs = load_objects(names, meshes)
-    given = [spec.name for spec in specs]
-    if (i := first_repeated(given)) is not None:
-        raise DemoError(f"The object {given[i]} is given twice. Name each object once.")
     batches = []
     for side in sides:
         for spec in specs:

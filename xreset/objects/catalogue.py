@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from xreset.errors import ObjectError
+from xreset.files.checks import first_repeated
 from xreset.files.storage import file_hash
 from xreset.files.text import short_name, shown
 from xreset.objects.meshes import import_mesh
@@ -152,4 +153,7 @@ def load_objects(
     names = (names,) if isinstance(names, str) else tuple(names)
     if not names:
         raise ObjectError("No object is named. Name one or several, or give None for all.")
-    return tuple(load_object(name, meshes) for name in names)
+    loaded = tuple(load_object(name, meshes) for name in names)
+    if (i := first_repeated([obj.name for obj in loaded])) is not None:
+        raise ObjectError(f"The object {loaded[i].name} is given twice. Name each object once.")
+    return loaded

@@ -110,6 +110,7 @@ def drawn_goals(
         families = (families,)
     if families is None:
         families = () if poses else FAMILIES
+    families = tuple(dict.fromkeys(families))
     if unknown := [family for family in families if family not in FAMILIES]:
         raise GoalError(f"Unknown family {unknown[0]!r}. Choose from: {', '.join(FAMILIES)}.")
     own = [_own_pose(pose) for pose in poses]

@@ -54,7 +54,7 @@ from xreset.learning.run import (
     read_run,
 )
 from xreset.learning.runner import TrainingRunner, _stop_on_interrupt
-from xreset.learning.train import cleanly
+from xreset.learning.train import cleanly, refuse_another_training
 from xreset.policy.onnx_policy import check_contract
 from xreset.task.config import RandomizationConfig, RewardConfig
 
@@ -303,6 +303,9 @@ class TrainingTest(WithBank):
             message = f"job-again holds another training: {problem}.*Choose another folder, or .*xreset train --out"
             with refuses(self, message, RunError, problem):
                 again(**changes)
+        present = read_run(out)
+        with self.assertRaisesRegex(RunError, "robot is 'openarm' there and 'ur7e-sharpa' here"):
+            refuse_another_training(out, present, replace(present, robot="ur7e-sharpa"), None)
         self.assertEqual(len(checkpoints(out)), 2)
 
     def test_the_same_call_goes_on_with_a_bank_that_has_no_file(self):
@@ -720,6 +723,7 @@ class TrainingTest(WithBank):
                 "different meshes of 005",
                 {"goals": toy_goals(self.robot, object_sources=("abc", "stand-in"))},
             ),
+            ("there is no teacher. Add --teacher, or", {"cameras": "front"}),
             ("bank is a goal set, .* Give it as goals", {"bank": toy_goals(self.robot)}),
             ("no state to reset to.*demo-probability 0", {"bank": empty}),
             ("reset bank for the robot 'openarm'", {"robot": "ur7e-sharpa"}),

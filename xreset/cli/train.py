@@ -57,10 +57,10 @@ def command_for(arguments: list[str]) -> Callable[..., None]:
         """Leave out what the configuration holds already, and a configuration that nobody gave."""
         if continues:
             options["config"] = options["config"] if changes else None
-        else:
+        elif given.teacher:
             options["cameras"] = ()
-            if not given.teacher:
-                options["recipe"] = None
+        else:
+            options["recipe"] = None
 
     return verb(verbs.train, prepare=prepare, config=config)
 

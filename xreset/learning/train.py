@@ -122,7 +122,7 @@ def _identity(info: RunInfo, teacher: str | None) -> dict[str, Any]:
     config = dict(flat(asdict(info.config)))
     del config["iterations"], config["save_interval"]
     return {
-        "robot": str(Path(info.robot).resolve()),
+        "robot": str(Path(info.robot).resolve()) if Path(info.robot).is_dir() else info.robot,
         "hash of the reset bank": info.resets_hash,
         "meshes": str(Path(info.meshes).resolve()) if info.meshes else None,
         "engine": info.engine,

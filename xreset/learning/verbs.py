@@ -263,6 +263,10 @@ def _configuration(
     if teacher is not None and (recipe is not None or weights is not None):
         given = "weights" if recipe is None else "recipe"
         raise RunError(f"The configuration of a student follows from its teacher. Omit {given}.")
+    if cameras and teacher is None:
+        raise RunError(
+            "Cameras are for students, and there is no teacher. Add --teacher, or omit --camera."
+        )
     if config is not None and recipe is not None:
         raise XResetError("Both recipe and config are given. Give one of them.")
     if config is not None:

@@ -587,6 +587,8 @@ class Commands(InFolder):
             "Nothing was overwritten",
             refused("demos select", file, "--out", left, "--rest", left, "--share 0.5"),
         )
+        said = refused("demos select", file, "--share 0.5 --seed 3")
+        self.assertIn("--seed 3 is for random picks. Add --pick random", said)
         one = f"{self.folder}/one.npz"
         write_demos(one, synthesize(["banana"], 1, fps=10))
         said = succeeds("demos select", file, one, "--per-object 1 --rest", rest)

@@ -192,6 +192,10 @@ class Selection(Options):
             raise DemoError(
                 f"--pick {self.pick} needs a number of sequences. Add --per-object or --share."
             )
+        if self.seed and self.pick != "random":
+            raise DemoError(
+                f"--seed {self.seed} is for random picks. Add --pick random, or omit it."
+            )
         return {
             "objects": self.objects or None,
             "names": self.sequences or None,

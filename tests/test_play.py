@@ -174,7 +174,10 @@ class Played(InFolder):
             (session.choose_object, "nosuch", "Unknown object 'nosuch'"),
             (session.choose_policy, "nosuch", "Unknown policy 'nosuch'"),
         ):
-            with refuses(self, words, XResetError):
+            with (
+                patch("xreset.eval.play.session.Controller", side_effect=AssertionError),
+                refuses(self, words, XResetError),
+            ):
                 choose(name)
         for name, value in session.world.state.items():
             assert_array_equal(value, before[name])

@@ -193,8 +193,6 @@ class Session:
     ) -> None:
         """Open a world; where this fails, the session stays as it was."""
         policy = load_policy(policy, robot=robot)
-        rests = policy.content is None and policy.name == RESTS
-        controller = None if rests else Controller(policy.graph, policy.name)
         folder = policy.meshes_folder(self._folder)
         if self._demos is None:
             names = object_names(folder)
@@ -206,6 +204,8 @@ class Session:
             names = inputs.bank.object_names
         usual = ALIASES["soup"]
         name = canonical_name(object_name or (usual if usual in names else names[0]), names)
+        rests = policy.content is None and policy.name == RESTS
+        controller = None if rests else Controller(policy.graph, policy.name)
         source = self._demos or synthesize([name], STARTS, meshes=folder)
         inputs = load_inputs(source, robot=policy.robot, meshes=folder, only=[name])
         scene = scene_of(policy.robot, inputs.objects[0], policy.task)

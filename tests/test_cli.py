@@ -499,6 +499,14 @@ class OutputTest(InFolder):
             said = refused("retarget none --robot openarm --out", self.folder / "new/motion.npz")
         self.assertIn(f"the folder {self.folder} is read-only. Choose another place", said)
 
+    def test_a_read_only_folder_that_no_option_names_is_refused_before_the_work(self):
+        with (
+            patch("xreset.files.storage.os.access", return_value=False),
+            self.assertRaisesRegex(XResetError, "the folder is read-only. Choose another place"),
+            claim_folder(self.folder),
+        ):
+            self.fail("the work began")
+
     def test_a_folder_whose_name_has_a_dot_is_written_again(self):
         def write(*, out: Path) -> None:
             with claim_folder(out):

@@ -190,7 +190,7 @@ def claim_folder(path: str | Path) -> Iterator[None]:
     """Make a folder unless it exists, and :func:`claim` it.
 
     Raises:
-        XResetError: another command is writing into the folder, or it cannot be made.
+        XResetError: another command is writing into the folder, or it cannot be made or written.
     """
     path = Path(path)
     try:
@@ -199,6 +199,8 @@ def claim_folder(path: str | Path) -> Iterator[None]:
         raise XResetError(
             f"cannot make the folder {path}: {error.strerror or error}. Choose another place."
         ) from error
+    if not os.access(path, os.W_OK):  # results would be lost at the end
+        raise XResetError(f"cannot write {path}: the folder is read-only. Choose another place.")
     with claim(path):
         yield
 

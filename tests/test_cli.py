@@ -145,6 +145,10 @@ class UsageTest(TestCase):
                 r"episode_seconds is -1.0, expected a number from 0.0167, which is one control step",
                 "eval zero --robot openarm --demos none.npz --episode-seconds -1",
             ),
+            (
+                r"--fps is 0\.0, expected a number from 0\.1 to 10000",
+                "demos import keypoints a --order mano --units m --coordinates table --out x.npz --fps 0",
+            ),
             (r"--minutes is nan, expected a number above 0", "train --out x --minutes nan"),
             (
                 r"reach\.width is nan, expected a finite number or a word",

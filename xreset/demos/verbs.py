@@ -16,6 +16,7 @@ from xreset.files.checks import (
     Options,
     OutputFile,
     PositiveInt,
+    Rule,
     Seed,
     Share,
     first_repeated,
@@ -23,12 +24,17 @@ from xreset.files.checks import (
     obeys_rules,
 )
 from xreset.files.progress import Progress, unseen
+from xreset.files.records import RATE
 from xreset.files.storage import file_hash
 
 if TYPE_CHECKING:
     from xreset.demos.archive import Demos
 else:  # a command has files in place of these
     Demos = Any
+
+Rate = Annotated[
+    float, Rule(f"a number from {RATE[0]:g} to {RATE[1]:g}", lambda x: RATE[0] <= x <= RATE[1])
+]
 
 
 @obeys_rules
@@ -60,7 +66,7 @@ def import_keypoints(
     units: Literal["m", "mm"],
     coordinates: Literal["table", "camera"],
     table_from_camera: str | Path | None = None,
-    fps: float | None = None,
+    fps: Rate | None = None,
     object_name: Annotated[str | None, Option("object")] = None,
     side: Literal["right", "left"] | None = None,
     meshes: str | Path | None = None,

@@ -24,7 +24,7 @@ from xreset.files.checks import (
     obeys_rules,
 )
 from xreset.files.progress import NamedProgress, Progress, unseen
-from xreset.files.storage import claim_folder
+from xreset.files.storage import claim_folder, must_be_new
 from xreset.files.text import quantity
 from xreset.physics.plugins import Device
 
@@ -362,6 +362,7 @@ def export_deploy(
     from xreset.live.deploy import with_objects, write_deployed
     from xreset.objects.catalogue import load_objects
 
+    must_be_new(Path(out))  # before the graph is made, which takes half a minute
     spec = load_policy(policy, robot=robot)
     folder = spec.meshes_folder(meshes)
     listed = load_objects(only or spec.objects_of(folder), folder)

@@ -32,6 +32,7 @@ from xreset import (
     CameraConfig,
     TaskConfig,
     VisionConfig,
+    export_deploy,
     load_policy,
     synthesize,
 )
@@ -182,6 +183,11 @@ class ToyTest(InFolder):
         self.assertTrue(set(shapes) <= set(self.contract["values"]))
         with self.assertRaisesRegex(XResetError, "is there already"):
             write_deployed(b"", self.out)
+        with (
+            mock.patch("xreset.eval.policy_spec.load_policy", side_effect=AssertionError),
+            self.assertRaisesRegex(XResetError, "is there already"),
+        ):
+            export_deploy("soup-can", self.out)
         with self.assertRaisesRegex(
             LiveError, "has no object 'hat'. Choose from: brick.*--object NAME"
         ):

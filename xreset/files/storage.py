@@ -75,6 +75,14 @@ def write_whole(path: str | Path, content: bytes | memoryview | str) -> None:
         file.write(content.encode() if isinstance(content, str) else content)
 
 
+def must_be_new(path: Path) -> None:
+    """Refuse, with ``XResetError``, a folder with content, or a file, where a folder will be made."""
+    if path.exists() and (not path.is_dir() or any(path.iterdir())):
+        raise XResetError(
+            f"{path} is there already. Nothing was changed; give another folder, or remove it."
+        )
+
+
 @contextmanager
 def atomic_folder(path: Path) -> Iterator[Path]:
     """Make a temporary folder that becomes ``path`` when the block ends, and is removed if the block raises.
@@ -86,10 +94,7 @@ def atomic_folder(path: Path) -> Iterator[Path]:
     """
     path = Path(os.path.realpath(path))
     try:
-        if path.exists() and (not path.is_dir() or any(path.iterdir())):
-            raise XResetError(
-                f"{path} is there already. Nothing was changed; give another folder, or remove it."
-            )
+        must_be_new(path)
         with _temporary(path.parent, Path.mkdir) as temporary:
             remove_leftovers(path.parent)
             try:

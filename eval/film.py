@@ -9,17 +9,19 @@ import numpy as np
 from xreset.env.manipulation import ManipulationEnv
 from xreset.errors import XResetError
 from xreset.eval.policy_spec import PolicySpec, load_policy
-from xreset.files.storage import check_suffix, write_whole
+from xreset.files.checks import Mp4, PositiveFloat, obeys_rules
+from xreset.files.storage import write_whole
 from xreset.pictures.render import encode_mp4
 
 
+@obeys_rules
 def film(
     policy: str | Path | PolicySpec,
     env: ManipulationEnv,
-    path: str | Path,
+    path: Mp4,
     *,
     world: int = 0,
-    fps: float = 20.0,
+    fps: PositiveFloat = 20.0,
     size: tuple[int, int] = (640, 480),
 ) -> None:
     """Play one episode in every world, and write an mp4 of one of them at its own speed.
@@ -37,7 +39,6 @@ def film(
         PolicyError: the policy is unknown, or cannot play in this environment.
         XResetError: the path does not end in ``.mp4``, the world does not exist, or the film cannot be encoded.
     """
-    check_suffix("path", path, ".mp4")
     if not 0 <= world < env.num_envs:
         raise XResetError(f"World {world} does not exist. Choose one from 0 to {env.num_envs - 1}.")
     policy = load_policy(policy)

@@ -53,7 +53,7 @@ class FaceTest(TestCase):
         }
         # of functions that are commands, too
         elsewhere |= {"Annotated", "Device", "Option", "Output", "Port", "Pose", "Png"}
-        elsewhere |= {"Progress", "NamedProgress", "OutputFile"}
+        elsewhere |= {"Progress", "NamedProgress", "OutputFile", "Onnx", "Mp4"}
         functions = 0
         for name in xreset.__all__:
             value = getattr(xreset, name)
@@ -173,13 +173,15 @@ class FromABankTest(InOneFolder):
                 (("no-such-policy", env, "film.mp4"), "no-such-policy"),
                 (
                     ("soup-can", env, "film.gif"),
-                    "^path is film.gif, expected a name that ends in .mp4",
+                    "^path is 'film.gif', expected a name that ends in .mp4",
                 ),
             ):
                 with refuses(self, message, xreset.XResetError):
                     xreset.film(*arguments)
             with self.assertRaisesRegex(xreset.XResetError, "World 1 does not exist"):
                 xreset.film("soup-can", env, "film.mp4", world=1)
+            with self.assertRaisesRegex(xreset.XResetError, "fps is 0, expected a number above"):
+                xreset.film("soup-can", env, "film.mp4", fps=0)
 
     def test_other_learning_code_trains(self):
         self.assertRegex(run("10_gymnasium", self.bank), r"iteration 3: reward per step -?\d")

@@ -661,7 +661,7 @@ class TrainingTest(WithBank):
             (
                 latest_checkpoint(out),
                 "policy.pt",
-                "^policy is policy.pt, expected a name that ends in .onnx",
+                "^policy is 'policy.pt', expected a name that ends in .onnx",
             ),
             (out / "checkpoints" / "9.pt", own, "there is no .*9.pt .checkpoint"),
             (out, own, "is a folder or a device, expected a file .checkpoint"),

@@ -110,6 +110,7 @@ OutputFile = Annotated[Output, Rule("a file, not a folder", lambda path: not os.
 Json = Annotated[OutputFile, _ends_in(".json")]
 JsonOrPage = Annotated[OutputFile, _ends_in(".json", ".md")]
 Mp4 = Annotated[OutputFile, _ends_in(".mp4")]
+Onnx = Annotated[OutputFile, _ends_in(".onnx")]
 Png = Annotated[OutputFile, _ends_in(".png")]
 PngOrMp4 = Annotated[OutputFile, _ends_in(".png", ".mp4")]
 Positive = Annotated[T, Rule("a number above 0 and finite", lambda x: 0 < x < inf)]
@@ -260,11 +261,6 @@ def check_value(name: str, value: Any, marks: Iterable[Any]) -> None:
     for mark in marks:
         if isinstance(mark, Check) and value is not None:
             mark.refuse(value)
-
-
-def check_port(port: int) -> None:
-    """Refuse, with ``XResetError``, a port that no machine has."""
-    check_value("port", port, marks_in(Port))
 
 
 def obeys_rules(function: Callable[P, T]) -> Callable[P, T]:

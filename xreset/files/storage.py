@@ -434,12 +434,6 @@ def must_exist(path: Path, what: str) -> None:
         raise FileFormatError(f"{path} cannot be read: {error.strerror}.") from error
 
 
-def check_suffix(name: str, path: str | Path, suffix: str) -> None:
-    """Refuse, with ``XResetError``, an output file that does not end in ``suffix``; the message calls it ``name``."""
-    if Path(path).suffix.lower() != suffix:
-        raise XResetError(f"{name} is {path}, expected a name that ends in {suffix}.")
-
-
 def check_schema(path: Path, found: Any, expected: str, what: str | None = None) -> None:
     """Refuse, with ``FileFormatError``, a file that states another schema than the one expected.
 

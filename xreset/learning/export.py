@@ -7,7 +7,8 @@ from pathlib import Path
 import torch
 from tensordict import TensorDict
 
-from xreset.files.storage import check_suffix, file_hash, must_exist, write_whole
+from xreset.files.checks import Onnx, obeys_rules
+from xreset.files.storage import file_hash, must_exist, write_whole
 from xreset.learning.checkpoint import must_fit, read_checkpoint
 from xreset.learning.model import ExportedPolicy, PointNetLstmModel, make_actor
 from xreset.learning.run import RunInfo, read_run
@@ -53,7 +54,8 @@ def exported(
     return model.SerializeToString()
 
 
-def export_checkpoint(checkpoint: str | Path, policy: str | Path) -> None:
+@obeys_rules
+def export_checkpoint(checkpoint: str | Path, policy: Onnx) -> None:
     """Write the policy of one checkpoint of a training as an ONNX file.
 
     :func:`~xreset.eval.policy_spec.load_policy` takes a checkpoint as well, and the newest one of a run folder.
@@ -67,7 +69,6 @@ def export_checkpoint(checkpoint: str | Path, policy: str | Path) -> None:
         FileFormatError: there is no such checkpoint, or it or the run's description is damaged.
         XResetError: the name of the policy does not end in ``.onnx``, or the file cannot be written.
     """
-    check_suffix("policy", policy, ".onnx")
     path = Path(checkpoint)
     must_exist(path, "checkpoint")
     write_whole(policy, exported_checkpoint(path, read_run(path.parent.parent)))

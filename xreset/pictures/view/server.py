@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from xreset.errors import XResetError, needs
-from xreset.files.checks import check_port
+from xreset.files.checks import Port, obeys_rules
 from xreset.files.text import plain
 from xreset.geometry.kinematics import on_host
 from xreset.geometry.shapes import quat_of
@@ -37,7 +37,8 @@ _ROOM = np.array((0.0, 0.0, 0.3))
 class WebPage:
     """A page at :attr:`url` until :meth:`close`. It shows the table, and answers its own visitors only."""
 
-    def __init__(self, host: str, port: int, label: str) -> None:
+    @obeys_rules
+    def __init__(self, host: str, port: Port, label: str) -> None:
         """Start the server.
 
         Args:
@@ -48,7 +49,6 @@ class WebPage:
         Raises:
             XResetError: viser is not installed, the port is impossible, or the server does not start.
         """
-        check_port(port)
         with needs("viser, without which --out of xreset view works,", "viewer"):
             import viser
         try:

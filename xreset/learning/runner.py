@@ -46,8 +46,8 @@ FAULT_WINDOW = 200
 """Iterations over which the share is taken. The first iterations may use the allowance of the whole window."""
 
 CRITIC_ITERATIONS = 200
-"""Iterations in which the new critic of a policy that learns on learns alone: a critic that knows little undoes what
-the policy has learned. Thirty are too few (docs/lab-book.md)."""
+"""Iterations in which the new critic of a policy that learns on learns alone. With 30 of them the policy lost a third
+of what it knew (docs/lab-book.md, "A policy that learns on")."""
 _OBSERVED = 100_000_000
 """Observations that the normalization of a policy that learns on counts as seen: those of a training of 15 minutes."""
 

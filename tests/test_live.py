@@ -220,6 +220,9 @@ class FaultTest(TestCase):
             with self.assertRaisesRegex(LiveError, f"{name} is {value}, expected 0 or more"):
                 Limits(**{name: value})
         driver = Scripted(after(1, object_time=0.99))
+        for name in ("joint_speed", "target_speed"):
+            with self.assertRaisesRegex(LiveError, f"{name} is 0, expected a share above 0"):
+                Limits(**{name: 0})
         self.reason(driver, limits=Limits(slow_down=0.0, hold=0.1))
         self.assertTrue(np.isfinite(driver.sent).all())
         assert_array_equal(np.diff(driver.sent[-4:], axis=0), 0)

@@ -47,6 +47,9 @@ class Limits:
             value = getattr(self, entry.name)
             if entry.name != "workspace" and not value >= 0:
                 raise LiveError(f"{entry.name} is {value}, expected 0 or more.")
+            # a joint without a speed limit has the limit infinity, and no share of it
+            if entry.name in ("joint_speed", "target_speed") and value == 0:
+                raise LiveError(f"{entry.name} is 0, expected a share above 0.")
         if self.workspace is not None and not np.less(*self.workspace).all():
             raise LiveError(
                 f"workspace is {self.workspace}, expected the lowest and the highest corner of a box [m]."

@@ -571,13 +571,11 @@ class TrainingTest(WithBank):
         ppo = replace(CONFIG.ppo, average=0.08)
         config = replace(starting_config(str(policy)), ppo=ppo, iterations=1, save_interval=1)
         self.assertEqual(config.task, CONFIG.task)
-        with (
-            patch("xreset.learning.train.CRITIC_ITERATIONS", 2),
-            patch("xreset.learning.runner.CRITIC_ITERATIONS", 2),
-        ):
+        with patch("xreset.learning.train.CRITIC_ITERATIONS", 2):
             out = self.train("on", config=config, weights=policy)
             before = newest(out)
-            self.resume(out, iterations=3)
+            self.resume(out, iterations=2)
+            self.resume(out, iterations=3)  # from where the actor begins to learn
         info = read_run(out)
         self.assertEqual((info.weights, info.weights_hash), (str(policy), file_hash(policy)))
         first, second, third = map(read_checkpoint, checkpoints(out))

@@ -30,7 +30,6 @@ class SequenceDistillation(Distillation):
     Attributes:
         networks: name -> network that a checkpoint holds. The teacher is in a file of its own.
         teacher_share: share of the worlds in which the teacher acts.
-        critic_only: as for :class:`~xreset.learning.ppo.SequencePpo`; there is no critic.
     """
 
     def __init__(
@@ -60,7 +59,6 @@ class SequenceDistillation(Distillation):
         self.sequence_length = p.sequence_length
         self.num_mini_batches = p.minibatches(len(obs))
         self.teacher_share = 0.0
-        self.critic_only = False
 
     def act(self, obs: TensorDict) -> Tensor:
         """[N, J] the actions to take: the student's, and the teacher's in the first of the worlds."""

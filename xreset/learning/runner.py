@@ -61,6 +61,7 @@ class TrainingRunner:
         elapsed: time of all iterations [s].
         processes: this process among those that train together.
         alg: the algorithm, with its networks.
+        critic_iterations: number of iterations at the beginning in which only the critic learns.
     """
 
     def __init__(
@@ -100,6 +101,7 @@ class TrainingRunner:
         self.iteration = 0
         self.env_steps = 0
         self.elapsed = 0.0
+        self.critic_iterations = 0
         self._average = {}
         if config.ppo.average > 0:
             self._average = {name: value.clone() for name, value in self._actor_state().items()}
@@ -181,9 +183,9 @@ class TrainingRunner:
         schedule = self.config.schedule
         if schedule.teacher and isinstance(self.alg, SequenceDistillation):
             self.alg.teacher_share = value_at(schedule.teacher, progress)
-        if self.alg.critic_only:
-            self.alg.critic_only = self.iteration < CRITIC_ITERATIONS
-            if not self.alg.critic_only:
+        if self.critic_iterations and isinstance(self.alg, SequencePpo):
+            self.alg.critic_only = self.iteration < self.critic_iterations
+            if self.iteration == self.critic_iterations:
                 self.alg.learning_rate = SLOWEST
 
     def _iterate(self, obs: TensorDict, log: TrainingLog | None) -> TensorDict:

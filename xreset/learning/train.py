@@ -449,7 +449,7 @@ def run_training(
                 )
         elif info.weights is not None:
             runner.load_networks(Path(info.weights))
-        runner.alg.critic_only = learns_on and runner.iteration < CRITIC_ITERATIONS
+        runner.critic_iterations = CRITIC_ITERATIONS if learns_on else 0
         if processes.is_main:
             _write_start(out, info, runner.iteration, is_new=newest is None, resumed=resumed)
         stopped_by = runner.learn(info.total, minutes=info.minutes)

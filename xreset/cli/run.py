@@ -75,7 +75,7 @@ def run(
     from xreset.demos.archive import demo_objects, read_demos
     from xreset.eval.study.steps import engines_left
     from xreset.geometry.description import load_robot
-    from xreset.learning.recipes import default_config, starting_config
+    from xreset.learning.recipes import starting_config
     from xreset.learning.verbs import ENGINE
     from xreset.resets.schedule import shared_worlds
     from xreset.retarget.file import read_retargeted
@@ -86,7 +86,7 @@ def run(
     # what the last steps would refuse, after minutes of work; engines last, because they take seconds to load
     archive = read_demos(demos)
     spec = load_robot(robot)
-    config = starting_config(recipe) if recipe else default_config(weights)[1]
+    config = starting_config(str(recipe or weights or "default"))
     task = config.task
     if weights is not None:
         from xreset.learning.train import networks_to_start_with

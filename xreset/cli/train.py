@@ -15,7 +15,7 @@ from xreset.cli._verbs import verb
 from xreset.errors import RunError
 from xreset.learning import verbs
 from xreset.learning.config import TrainConfig
-from xreset.learning.recipes import default_config, starting_config
+from xreset.learning.recipes import starting_config
 
 _HELP_CONFIG = "--help-config"
 
@@ -40,10 +40,9 @@ def command_for(arguments: list[str]) -> Callable[..., None]:
         from xreset.learning.train import config_of_student
 
         config = config_of_student(given.teacher, given.camera or "front")
-    elif recipe:
-        config = starting_config(recipe)
     else:
-        recipe, config = default_config(given.weights)
+        recipe = recipe or given.weights or "default"
+        config = starting_config(recipe)
     config = take_terms(config, arguments)
     if given.help_config is not None:
         _show_config(given.help_config.removeprefix("config."), config)

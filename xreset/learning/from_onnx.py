@@ -48,8 +48,7 @@ def network_of(policy: OnnxPolicy) -> PointNetLstmModel:
             difference = (model(observations).clamp(-1, 1) - policy.act(observations)).abs().max()
     if not difference < _CLOSE:
         raise PolicyError(
-            f"{policy.path} cannot be trained or teach: rebuilt from its file, its network acts otherwise "
-            f"({difference:.2g})."
+            f"The network of {policy.path} cannot be rebuilt: its actions differ from the file's by {difference:.2g}."
         )
     model.reset()
     return model.requires_grad_(False)
@@ -67,7 +66,7 @@ def _rebuilding(policy: OnnxPolicy) -> Iterator[None]:
         yield
     except (KeyError, IndexError, StopIteration, RuntimeError, ValueError) as error:
         raise PolicyError(
-            f"{policy.path} cannot be trained or teach: its network is not built as xreset exports it ({error})."
+            f"The network of {policy.path} cannot be rebuilt: it is not built as xreset exports it ({error})."
         ) from error
 
 

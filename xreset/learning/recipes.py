@@ -103,14 +103,6 @@ RECIPES = _read_recipes()
 """Name -> recipe."""
 
 
-def default_config(weights: str | Path | None) -> tuple[str, TrainConfig]:
-    """Return where the configuration comes from if nothing is said, and the configuration: that of the run or of the
-    policy whose weights are given, else the recipe ``default``."""
-    if weights is None:
-        return "default", TrainConfig()
-    return str(weights), starting_config(str(weights))
-
-
 def starting_config(recipe: str) -> TrainConfig:
     """Return the configuration of a recipe, of a file, of a run or of a policy, without reward terms that a user added.
 

@@ -15,7 +15,7 @@ from xreset.cameras.config import CameraConfig
 from xreset.errors import RunError, XResetError
 from xreset.files.checks import Option, Output, PositiveFloat, PositiveInt, Seed, obeys_rules
 from xreset.learning.config import TrainConfig
-from xreset.learning.recipes import default_config, for_robots, from_home, starting_config
+from xreset.learning.recipes import for_robots, from_home, starting_config
 from xreset.learning.run import RobotData, RunInfo, checkpoints, read_run
 from xreset.physics.plugins import Device, backend_class, device_for
 
@@ -275,9 +275,7 @@ def _configuration(
         from xreset.learning.train import config_of_student
 
         return config_of_student(teacher, cameras or "front")
-    if recipe is not None:
-        return starting_config(str(recipe))
-    return default_config(weights)[1]
+    return starting_config(str(recipe or weights or "default"))
 
 
 def _device(device: str | None, engine: str, present: RunInfo | None) -> str:

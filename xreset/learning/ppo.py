@@ -207,7 +207,10 @@ class SequencePpo(PPO):
 
     def _value_loss(self, observations: TensorDict, first: Tensor) -> Tensor:
         """Return the mean squared error of the values of the minibatch of ``_worlds``, in units of the returns'
-        deviation if the critic knows it."""
+        deviation if the critic knows it.
+
+        A critic that learns alone is new, and far from the returns: its values are not held near the old ones.
+        """
         storage = self.storage
         worlds = self._worlds
         state = piece_states(storage.saved_hidden_state_c, worlds, self.sequence_length)
@@ -216,6 +219,8 @@ class SequencePpo(PPO):
         returns = storage.returns[:, worlds]
         unit = self.critic.return_std if isinstance(self.critic, ReturnCritic) else 1.0
         error = (values - returns) / unit
+        if self.critic_only:
+            return error.square().mean()
         near = old_values + unit * ((values - old_values) / unit).clamp(
             -self.clip_param, self.clip_param
         )

@@ -48,8 +48,6 @@ FAULT_WINDOW = 200
 CRITIC_ITERATIONS = 200
 """Iterations in which the new critic of a policy that learns on learns alone. With 30 of them the policy lost a third
 of what it knew (docs/lab-book.md, "A policy that learns on")."""
-_OBSERVED = 100_000_000
-"""Observations that the normalization of a policy that learns on counts as seen: those of a training of 15 minutes."""
 
 
 class TrainingRunner:
@@ -315,7 +313,7 @@ class TrainingRunner:
         self.elapsed = content.elapsed
 
     def load_networks(self, path: Path) -> None:
-        """Start with the actor and the critic of another run's checkpoint, with normalization and standard deviation.
+        """Start with the actor and the critic of another run's checkpoint, with standard deviation and normalization.
 
         The learning rate starts where the other run's rate was: a new run's rate would undo in one step what the
         networks have learned.
@@ -328,8 +326,6 @@ class TrainingRunner:
         network = network_of(policy)
         actor = self.alg.networks["actor"]
         actor.load_state_dict(actor.state_dict() | network.state_dict())
-        # the policy was trained with this normalization, which new observations must not replace
-        actor.trunk.normalizer.count.fill_(_OBSERVED)
         for name, mean in self._average.items():
             mean.copy_(actor.state_dict()[name])
 

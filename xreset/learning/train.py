@@ -449,6 +449,8 @@ def run_training(
                 )
         elif info.weights is not None:
             runner.load_networks(Path(info.weights))
+        if info.weights is not None:
+            runner.alg.networks["actor"].keeps_normalization = True
         runner.critic_iterations = CRITIC_ITERATIONS if learns_on else 0
         if processes.is_main:
             _write_start(out, info, runner.iteration, is_new=newest is None, resumed=resumed)

@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import field, fields, replace
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from xreset.eval.policy_spec import PolicySpec
 from xreset.eval.results import Rollouts, Trace
 from xreset.files.checks import frozen
 from xreset.files.progress import Progress, unseen
+from xreset.files.records import schema_of
 from xreset.physics import Backend, State
 from xreset.physics.plugins import backend_class, device_for, make_backend
 from xreset.policy.onnx_policy import Policy
@@ -126,7 +128,7 @@ class Trial:
     meshes: Path | None = None
     """Folder of the object meshes; None: the stand-ins."""
     inputs: dict[str, str] = field(default_factory=dict)
-    """SHA-256 of the policy and of the demos, or resets for a bank."""
+    """SHA-256 of the policy and of the demos; of their starts and goals if they are in no file."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -179,11 +181,9 @@ def load_trial(
         else_meshes=policy.meshes,
         accept=("demos", "motion", "goals"),
     )
-    hashes = {} if policy.hash is None else {"policy": policy.hash}
-    if inputs.hash is not None:
-        is_bank = isinstance(inputs.data, ResetBank) and not isinstance(inputs.data, GoalSet)
-        hashes["resets" if is_bank else "demos"] = inputs.hash
     bank = inputs.bank
+    hashes = {} if policy.hash is None else {"policy": policy.hash}
+    hashes["demos"] = inputs.hash or _hash_of(bank)
     used = [o for o in inputs.objects if o.name in bank.sequence_object]
     if isinstance(inputs.data, GoalSet):
         task = replace(task, reset=replace(task.reset, spawn_xy=0.0, spawn_yaw=0.0))
@@ -198,6 +198,15 @@ def load_trial(
         meshes=inputs.meshes,
         inputs=hashes,
     )
+
+
+def _hash_of(bank: ResetBank) -> str:
+    """Return the SHA-256 of starts and goals that are in no file."""
+    digest = sha256()
+    for name, column in schema_of(ResetBank).items():
+        if column.shape[:1] == ("S",):
+            digest.update(str(getattr(bank, name).tolist()).encode())
+    return digest.hexdigest()
 
 
 def roll_out(

@@ -578,6 +578,15 @@ class ResultsTest(InFolder):
         trained = load_trial(policy, bank).task.termination.episode_seconds
         self.assertEqual(trained, policy.task.termination.episode_seconds)
 
+    def test_starts_and_goals_that_are_in_no_file_are_told_apart(self):
+        """Reports compare results only if they are of the same ones."""
+        policy = load_policy("zero", robot="ur7e-sharpa")
+        bank = toy_bank(policy.robot)
+        other = replace(bank, goal_pos=bank.goal_pos + 0.01)
+        hashes = [load_trial(policy, each).inputs["demos"] for each in (bank, bank, other)]
+        self.assertEqual(hashes[0], hashes[1])
+        self.assertNotEqual(hashes[0], hashes[2])
+
     def test_the_shortest_episodes_have_traces(self):
         """Usually three control steps lie between two states; these episodes have one other state."""
         policy = load_policy("zero", robot="ur7e-sharpa")

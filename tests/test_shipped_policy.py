@@ -115,6 +115,6 @@ class ShippedPolicyTest(unittest.TestCase):
                 with tempfile.TemporaryDirectory() as folder:
                     options = {"num_envs": 4, "episodes": 1, "episode_seconds": 3.0}
                     (result,) = evaluate(name, demos, out=folder, **options)
-                self.assertEqual(list(result.inputs), ["policy"])
+                self.assertEqual(list(result.inputs), ["policy", "demos"])
                 self.assertEqual(len(result.episodes), 4)
                 self.assertGreaterEqual(result.mean("task_progress"), FLOOR)

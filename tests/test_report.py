@@ -285,6 +285,13 @@ class ClipTest(Reported):
             best = best_everywhere(pd.concat(parts, ignore_index=True))
             self.assertEqual(best["sequence"].tolist(), expected)
             self.assertFalse(best["repetition"].any())
+        with self.subTest("the same demonstrations in another order"):
+            other = alike.assign(run="other", sequence=1 - alike["sequence"])
+            found = traces["mujoco"]
+            swapped = [replace(trace, sequence=1 - trace.sequence) for trace in found]
+            parts = [recorded(alike, "mujoco", found), recorded(other, "mujoco", swapped)]
+            best = best_everywhere(pd.concat(parts, ignore_index=True))
+            self.assertEqual(best["sequence_name"].tolist(), ["demo_0", "demo_0"])
         words = "mujoco.trace.npz has a trace of demonstration 1000000"
         with self.assertRaisesRegex(FileFormatError, words):
             recorded(alike, "mujoco", [replace(first, sequence=1_000_000)])

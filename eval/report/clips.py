@@ -66,20 +66,20 @@ def best_everywhere(shown: Table) -> Table:
     everywhere.
 
     Best is the highest mean task progress over all of these, then the highest mean reorientation progress, then the
-    lowest index.
+    first. A demonstration is known by its name, because its index may be another one in each run.
 
     Args:
         shown: :func:`xreset.eval.results.recorded`.
     """
     places = len(shown.drop_duplicates(["run", "engine"]))
-    everywhere = shown.groupby("sequence").filter(lambda own: len(own) == places)
+    everywhere = shown.groupby("sequence_name").filter(lambda own: len(own) == places)
     metrics = ["task_progress", "reorientation_progress"]
     quality = (
-        everywhere.groupby("sequence")[metrics]
+        everywhere.groupby("sequence_name", sort=False)[metrics]
         .mean()
         .sort_values(metrics, ascending=False, kind="stable")
     )
-    return everywhere[everywhere["sequence"].isin(quality.index[:1])]
+    return everywhere[everywhere["sequence_name"].isin(quality.index[:1])]
 
 
 def worst_episodes(shown: Table, count: int) -> Table:

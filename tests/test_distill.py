@@ -187,6 +187,7 @@ class DistillTest(WithBank):
     def test_what_the_teacher_does_better(self):
         common = {
             "engine": "mujoco",
+            "seed": 0,
             "sequence_name": list("abcd"),
             "repetition": 0,
             "object": ["can", "can", "box", "box"],
@@ -207,4 +208,5 @@ class DistillTest(WithBank):
         unsolved = teacher.assign(reorient=False)
         words = "The teacher ends none of 4 episodes at the goal."
         self.assertEqual(missed_by_student(student, unsolved), words)
-        self.assertEqual(missed_by_student(student.assign(engine="sapien"), teacher), "")
+        for other in ({"engine": "sapien"}, {"seed": 1}):
+            self.assertEqual(missed_by_student(student.assign(**other), teacher), "", other)

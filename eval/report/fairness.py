@@ -175,7 +175,7 @@ def missed_by_student(student: Table, teacher: Table) -> str:
         student: episodes of the policy.
         teacher: episodes of its teacher; those from the same starts, in the same engines, are compared.
     """
-    same = ["engine", "sequence_name", "repetition", "object"]
+    same = ["engine", "seed", "sequence_name", "repetition", "object"]
     both = student.merge(teacher, on=same, suffixes=("", "_teacher"))
     solved = both[both["reorient_teacher"]]
     if not len(solved):

@@ -5,6 +5,7 @@ import io
 import os
 import threading
 from contextlib import redirect_stderr
+from dataclasses import asdict
 from unittest import mock
 
 import torch
@@ -98,6 +99,12 @@ class CurvesTest(InFolder):
             self.assertEqual(found, (iteration, 1.0, 0.0 if share else 0.5))
             self.assertEqual({p.iteration for p in curves.lift.passed}, set() if share else {2})
         curves.close()
+
+    def test_a_run_that_is_stopped_before_its_next_iteration_keeps_its_record(self):
+        done = Lift(iteration=4, env_steps=40, minutes=3.0, success_from_home=0.5)
+        write_json(self.folder / "run.json", {"lift": asdict(done)})
+        TrainingLog(self.folder, 2, "cpu", 5, done=4).close()
+        self.assertEqual(read_lift(self.folder), done)
 
     def test_each_iteration_is_on_disk_at_once_and_open_logs_share_nothing(self):
         hook = threading.excepthook

@@ -156,7 +156,8 @@ class TrainingLog:
             self._curves.close()
         if self._online is not None:
             self._online.finish()
-        self.write_lift()
+        if self.lift.iteration:  # else there is nothing new
+            self.write_lift()
 
     @contextmanager
     def _written(self) -> Iterator[None]:

@@ -338,6 +338,13 @@ class Toy(Robots):
             joint = tree.joint(name)
             self.assertEqual([joint.effort, joint.stiffness], drive)
 
+    def test_the_effort_of_a_joint_with_several_actuators_or_a_limit_of_its_own(self):
+        text = MJCF.replace("</actuator>", '<velocity joint="f1_1" kv="1"/></actuator>')
+        self.assertEqual(self.read("damped.xml", text)[0].joint("f1_1").effort, 2.0)
+        limited = '<joint name="f1_1" actuatorfrcrange="-0.5 0.5"'
+        text = MJCF.replace('<joint name="f1_1"', limited, 1)
+        self.assertEqual(self.read("limited.xml", text)[0].joint("f1_1").effort, 0.5)
+
     def test_an_actuator_of_a_floating_base_is_left_out(self):
         text = MJCF.replace('<body name="base">', '<body name="base"><freejoint name="float"/>', 1)
         text = text.replace("<actuator>", '<actuator><motor name="thrust" joint="float"/>', 1)

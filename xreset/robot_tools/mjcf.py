@@ -97,13 +97,14 @@ def read_mjcf(path: Path, notes: list[str]) -> RobotTree:
             limit = lever * float(model.actuator_forcerange[actuator, 1])
         elif kp == 0 and model.actuator_ctrllimited[actuator]:  # a motor: its control is a force
             limit = abs(gain) * lever * float(model.actuator_ctrlrange[actuator, 1])
-        if limit <= 0 and model.jnt_actfrclimited[joint]:
-            limit = float(model.jnt_actfrcrange[joint, 1])
-        stated = {"effort": max(limit, 0.0)}
+        if model.jnt_actfrclimited[joint]:
+            most = float(model.jnt_actfrcrange[joint, 1])
+            limit = min(limit, most) if limit > 0 else most
+        name = joint_name(model, joint)
+        stated = {"effort": max(limit, joints[name].effort)}
         if gain > 0 and kp > 0 and lever > 0:
             stated["stiffness"] = kp * lever**2
             stated["rotor"] = float(model.dof_armature[model.jnt_dofadr[joint]])
-        name = joint_name(model, joint)
         joints[name] = replace(joints[name], **stated)
     tree = replace(tree, joints=tuple(joints.values()))
     check_tree(tree)

@@ -58,12 +58,18 @@ def share_ci95(values: np.ndarray, runs: np.ndarray, groups: np.ndarray) -> Inte
     low, high = crossed_bootstrap_ci95(values, runs, groups)
     if high - low > 1e-9 or not 0 <= low <= high <= 1:
         return low, high
-    count = len(np.unique(groups)) if len(np.unique(groups)) > 1 else len(values)
+    count = _independent(values, groups)
     share = min((low + high) / 2, 1.0)
     shrunk = 1 + _Z**2 / count
     center = (share + _Z**2 / (2 * count)) / shrunk
     half = _Z / shrunk * np.sqrt(share * (1 - share) / count + _Z**2 / (4 * count**2))
     return max(0.0, float(center - half)), min(1.0, float(center + half))
+
+
+def _independent(values: np.ndarray, groups: np.ndarray) -> int:
+    """Return the number of demonstrations; that of episodes with a single one."""
+    count = len(np.unique(groups))
+    return count if count > 1 else len(values)
 
 
 def bootstrap_ci95(values: np.ndarray, groups: np.ndarray | None = None) -> Interval:
@@ -126,10 +132,12 @@ def difference_ci95(one: Sequence[np.ndarray], other: Sequence[np.ndarray]) -> I
 
 def difference_p(one: Sequence[np.ndarray], other: Sequence[np.ndarray]) -> float:
     """Return the two-sided p value of equal means: twice the share of the draws of :func:`difference_ci95` on the
-    smaller side of zero, where one more draw counts as a tie. It is at least 0.001."""
+    smaller side of zero, where one more draw counts as a tie. It is at least 0.001; and for n demonstrations 2^(1 - n),
+    the chance that all of them differ in the same direction."""
     differences = _mean_differences(one, other)
     fewer = min((differences <= 0).sum(), (differences >= 0).sum())
-    return min(1.0, 2 * float(fewer + 1) / (DRAWS + 1))
+    least = 2.0 ** (1 - _independent(one[0], one[2]))
+    return min(1.0, max(2 * float(fewer + 1) / (DRAWS + 1), least))
 
 
 def holm(p_values: Sequence[float]) -> list[bool]:

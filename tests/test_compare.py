@@ -389,6 +389,12 @@ class ScoreTest(Compared):
         chance = np.array(p_values[:200])
         self.assertTrue(0.02 < (chance < 0.05).mean() < 0.10, (chance < 0.05).mean())
         self.assertTrue(holm(p_values[191:])[-1], "a true difference among nine that are none")
+        for count, least in ((2, 0.5), (4, 0.125), (6, 2 / 64)):
+            with self.subTest(f"{count} demonstrations that all became better"):
+                gains = np.linspace(0.1, 0.3, count)
+                alike = (np.zeros(count, int), np.arange(count))
+                found = difference_p([0 * gains, *alike], [gains, *alike])
+                self.assertAlmostEqual(found, least)
 
     def test_the_page_marks_differences_that_are_certain(self):
         def progress(gain):

@@ -1,13 +1,14 @@
 """The judge of a robot: which accepted states hold, lift and turn their object."""
 
 from dataclasses import replace
+from unittest.mock import patch
 
 import numpy as np
 import torch
 from PIL import Image
 
 from tests import toy_grasp
-from tests.command import succeeds
+from tests.command import refused, succeeds
 from tests.data import InFolder
 from tests.toy_grasp import OPEN, brick, robot
 from xreset import SqueezeConfig, load_robot, write_bank
@@ -98,3 +99,9 @@ class Judge(InFolder):
         self.assertIn("place counts frames in which the arm follows the human", said)
         self.assertIn("demonstrations in reach): brick 0%", said)
         self.assertEqual(Image.open(picture).size[0], 4 * judging._TILE[0])
+        with patch.object(judging, "try_grasps", side_effect=RobotError("tried")) as tried:
+            refused("robots judge", self.folder / "bank.npz", "--robot gripper")
+            self.assertIn("mujoco", tried.call_args.args[3])
+            self.assertNotIn("mujoco-warp", tried.call_args.args[3], "it is slow on a CPU")
+            refused("robots judge", self.folder / "bank.npz", "--robot gripper --engine mujoco")
+            self.assertEqual([*tried.call_args.args[3]], ["mujoco"])

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from xreset.cli._terminal import console, show_table
 from xreset.physics.plugins import backend_names, backend_status
 from xreset.retarget.accounts import Account, described
-
-if TYPE_CHECKING:
-    from xreset.eval import rollout
 
 
 def usable_engines() -> list[str]:
@@ -34,12 +31,12 @@ def in_quick_engines(arguments: dict[str, Any]) -> None:
     arguments["engines"] = quick_engines(arguments.get("engines", ()), arguments["device"])
 
 
-def quick_engines(names: Sequence[str], device: str) -> list[rollout.Engine]:
-    """Return the engines of these names; without names, all that can be used here and are not slow on the device."""
-    from xreset.eval import rollout
+def quick_engines(names: Sequence[str], device: str) -> list[str]:
+    """Return names of engines, each once; without any, those that can be used here and are not slow on the device."""
+    from xreset.eval.rollout import chosen_engines
 
-    engines = rollout.chosen_engines(names or usable_engines(), device)
-    return [each for each in engines if names or not each.slow]
+    engines = chosen_engines(names or usable_engines(), device)
+    return [each.name for each in engines if names or not each.slow]
 
 
 def show_accounts(rows: Sequence[Account], title: str) -> None:

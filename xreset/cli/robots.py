@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from rich.text import Text
 
-from xreset.cli._common import in_all_engines
+from xreset.cli._common import in_quick_engines
 from xreset.cli._terminal import console, show_table
 from xreset.cli._verbs import verb
 from xreset.errors import RobotError
@@ -145,5 +145,5 @@ COMMAND = {
     "check": verb(verbs.check_robot, _show_check),
     "import": verb(verbs.import_robot, _show_import, arm=None),
     "place": verb(verbs.place_robot, _show_places),
-    "judge": verb(verbs.judge, _show_judged, prepare=in_all_engines, engines=()),
+    "judge": verb(verbs.judge, _show_judged, prepare=in_quick_engines, engines=()),
 }

@@ -94,7 +94,7 @@ def run(
         networks_to_start_with(weights, [spec], config)
     shared_worlds(archive.object_names, num_envs, task.reset.object_share)
     named = [engine] if isinstance(engine, str) else engine
-    engines = [each.name for each in quick_engines(named, "cpu")]
+    engines = quick_engines(named, "cpu")
     backend_class(ENGINE).engine_version()
     if minutes is None and iterations is None:
         minutes = _MINUTES

@@ -183,7 +183,8 @@ def judge(
         bank: states that physics accepted, made by xreset resets.
         robot: name or folder of the robot; default: that of the bank.
         objects: the objects of the bank; default: those of ``meshes``.
-        engines: physics engine to try the states in, or several; the command's default: all that can be used here.
+        engines: physics engine to try the states in, or several; the command's default: all that can be used here, on
+            a CPU without MuJoCo-Warp, which is slow there.
         meshes: folder of real meshes; default: that of the bank, else the stand-ins.
         states: number of states of each object: those in the air in which the thumb and another finger are nearest to
             the object, as many from each demonstration as possible. States in grasps of other demonstrations are left

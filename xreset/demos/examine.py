@@ -574,13 +574,14 @@ def _hand_jumps(r: Recording) -> np.ndarray:
 
 def _lost_frame(r: Recording) -> int:
     """Return the first frame in which an object goes on with a jump after its position or its orientation did not
-    change at all for a while; 0 if there is none."""
+    change at all for a while; 0 if there is none. The first step of one that stood still is no jump at a low rate."""
     quats = r.turn.as_quat()
+    dt = 1.0 / r.fps
     step = np.linalg.norm(np.diff(r.pos, axis=0), axis=1)
     angle = r.step_turn.magnitude()
     for same, jumps in (
-        (step == 0.0, step > _GOES_ON),
-        ((quats[1:] == quats[:-1]).all(axis=1), angle > _TURNS_ON),
+        (step == 0.0, step > _GOES_ON + _CALM * dt**2),
+        ((quats[1:] == quats[:-1]).all(axis=1), angle > _TURNS_ON + _TURN_CALM * dt**2),
     ):
         for frame in np.flatnonzero(jumps).tolist():
             begin = frame - int(_FROZEN * r.fps) - 1
@@ -619,9 +620,12 @@ def _doubts_of_tracking(r: Recording) -> Iterator[Finding]:
 
 
 def _moves(r: Recording) -> np.ndarray:
-    """[F-1] bool: whether the object moves around a step of its motion."""
+    """[F-1] bool: whether the object moves around a step of its motion, between the first and the last one."""
     around = np.pad(r.pos, ((1, 1), (0, 0)), mode="edge")
-    return np.linalg.norm(around[3:] - around[:-3], axis=1) * r.fps > 3 * _MOVES
+    moves = np.linalg.norm(around[3:] - around[:-3], axis=1) * r.fps > 3 * _MOVES
+    steps = np.flatnonzero(np.diff(r.pos, axis=0).any(axis=1))
+    moves[: steps.min(initial=len(moves))] = moves[steps.max(initial=-1) + 1 :] = False
+    return moves
 
 
 def _step(path: np.ndarray, frame: int) -> float:

@@ -1,6 +1,6 @@
 """learning: whether a small training learns as it did, as JSON with the stored band (ci/learning.json); exit status 1 if it does not.
 
-A gripper takes a brick between its jaws and lifts it (tests/toy_learning.py), in the task of the recipe minutes, or with --task small in the one
+A gripper takes a brick between its jaws and lifts it (tests/toy_learning.py), in the default task without random properties, or with --task small in the one
 of the tests (60 Hz, one cloud). --device cpu: MuJoCo, 60 iterations, 40 seconds. --device cuda: mujoco-warp, the paper's networks in bfloat16, as
 many iterations on every GPU; three minutes with compiling.
 """
@@ -27,7 +27,7 @@ _GPU_ITERATIONS = 200
 
 def add_arguments(group: argparse._ArgumentGroup) -> None:
     group.add_argument("--seed", type=int, default=0)
-    group.add_argument("--task", choices=("minutes", "small"), default="minutes")
+    group.add_argument("--task", choices=("default", "small"), default="default")
 
 
 def run(options: Options, console: Console) -> None:

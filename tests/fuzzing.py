@@ -221,7 +221,7 @@ def add_curves(every):
 
 def add_studies(every):
     path = every.add("study", "study.toml", read_study, "text", ("config",))
-    path.write_bytes((SHIPPED / "first_grasp.toml").read_bytes())
+    path.write_bytes((SHIPPED / "nine_objects.toml").read_bytes())
 
 
 def add_networks(every):

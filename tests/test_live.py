@@ -315,7 +315,7 @@ class FaultTest(TestCase):
 
 class EngineTest(TestCase):
     def test_the_graph_observes_what_the_environment_observes(self):
-        for name in ("paper", "robust", "live", "published"):
+        for name in ("paper", "default", "live", "published"):
             with self.subTest(name):
                 self._check(evaluation_task(RECIPES[name].config.task))
 

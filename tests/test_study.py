@@ -89,7 +89,7 @@ class FileTest(Studied):
                 read_study(self.file(BASE + text))
         for text, message in (("schema = ", "is not valid TOML"), ("about = 'x'", none)):
             self.assertRaisesRegex(FileFormatError, message, read_study, self.file(text))
-        with self.assertRaisesRegex(RunError, "Unknown study 'nothing'.*first_grasp.*seconds"):
+        with self.assertRaisesRegex(RunError, "Unknown study 'nothing'.*left_hands.*seconds"):
             study_path("nothing")
 
     def test_only_options_of_the_configuration_are_passed_on(self):

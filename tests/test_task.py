@@ -326,7 +326,7 @@ class RewardTest(TestCase):
             self.assertEqual(contact_gate(forces, 0.1, opposing=True), opposes, hand)
 
 
-MINUTES = {
+DEFAULT = {
     "observation": {
         "cloud": "paired", "rotation": "matrix", "cloud_scale": 5.0, "contact_force_scale": 0.03,
         "joint_target": True,
@@ -357,11 +357,11 @@ class EarlierOptionsTest(TestCase):
     """Files of 0.1 to 0.3 have options in place of terms."""
 
     def test_they_mean_terms(self):
-        live = {"observation": MINUTES["observation"] | {"rotation": "to_goal"}}
+        live = {"observation": DEFAULT["observation"] | {"rotation": "to_goal"}}
         for name, options in (
             ("paper", PAPER),
-            ("minutes", MINUTES),
-            ("live", MINUTES | live),
+            ("default", DEFAULT),
+            ("live", DEFAULT | live),
             ("published", PUBLISHED),
         ):
             task = RECIPES[name].config.task

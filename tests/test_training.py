@@ -56,7 +56,7 @@ from xreset.learning.run import (
 from xreset.learning.runner import TrainingRunner, _stop_on_interrupt
 from xreset.learning.train import cleanly, refuse_another_training
 from xreset.policy.onnx_policy import check_contract
-from xreset.task.config import RandomizationConfig, RewardConfig
+from xreset.task.config import RewardConfig
 
 ONE = replace(CONFIG, iterations=1)
 
@@ -371,9 +371,9 @@ class TrainingTest(WithBank):
 
     def test_a_recipe_may_be_a_file_of_the_users_own(self):
         path = self.folder / "mine.toml"
-        path.write_text('extends = "robust"\niterations = 7\nmodel.lstm = 64\n')
-        robust = RECIPES["robust"].config
-        expected = replace(robust, iterations=7, model=replace(robust.model, lstm=64))
+        path.write_text('extends = "live"\niterations = 7\nmodel.lstm = 64\n')
+        live = RECIPES["live"].config
+        expected = replace(live, iterations=7, model=replace(live.model, lstm=64))
         self.assertEqual(starting_config(str(path)), expected)
         for text, problem in (
             ('extends = "nothing"', "extends is 'nothing'. Choose from: default"),
@@ -434,18 +434,13 @@ class TrainingTest(WithBank):
 
         self.assertEqual(parsed(), TrainConfig())
         self.assertEqual(RECIPES["default"].config, TrainConfig())
-        minutes = parsed("--recipe minutes --config.ppo.entropy 0.001")
+        live = parsed("--recipe live --config.ppo.entropy 0.001")
         self.assertEqual(
-            (minutes.ppo.desired_kl, minutes.ppo.entropy, minutes.model.initial_std),
-            (0.02, 0.001, 0.3),
+            (live.ppo.desired_kl, live.ppo.entropy, live.model.initial_std), (0.02, 0.001, 0.3)
         )
-        robust = parsed("--recipe robust")
-        self.assertEqual(
-            replace(robust, task=replace(robust.task, randomization=RandomizationConfig())),
-            RECIPES["minutes"].config,
-        )
-        lstm = replace(robust.model, lstm=256)
-        self.assertEqual(replace(robust, model=lstm, iterations=2600), TrainConfig())
+        without = replace(live.task, randomization=TrainConfig().task.randomization)
+        ppo = replace(live.ppo, entropy=0.0)
+        self.assertEqual(replace(live, task=without, ppo=ppo), RECIPES["any_object"].config)
         self.assertEqual(
             parsed(f"--recipe={self.out} --config.save-interval 7"),
             replace(CONFIG, save_interval=7),
@@ -715,7 +710,7 @@ class TrainingTest(WithBank):
             ("000002.pt is a file. Give the folder", {"weights": latest_checkpoint(self.out)}),
             (f"folder above has one: give {self.out}", {"weights": self.out / "checkpoints"}),
             ("this training has no teacher", {"config": idle}),
-            ("Both recipe and config", {"recipe": "minutes"}),
+            ("Both recipe and config", {"recipe": "live"}),
             ("'mujoco' does not run on 'cuda'|can use 0 GPUs", {"device": "cuda"}),
             ("needs a reset bank .--resets., a goal set .--goals., or both", {"bank": None}),
             ("the goal set for 'ur7e-sharpa'", {"goals": toy_goals(robots.load("ur7e-sharpa"))}),

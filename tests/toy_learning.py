@@ -16,17 +16,18 @@ from tests import toy_grasp
 from xreset.env.manipulation import ManipulationEnv, make_scene
 from xreset.eval.report.read import read_curves
 from xreset.learning.config import ModelConfig, PpoConfig, TrainConfig
-from xreset.learning.recipes import RECIPES
 from xreset.learning.runner import TrainingRunner
 from xreset.resets.distribution import ResetDistribution
 from xreset.task.config import (
     ActionConfig,
     ObservationConfig,
+    RandomizationConfig,
     ResetConfig,
     RewardConfig,
     TaskConfig,
     TerminationConfig,
 )
+from xreset.task.default import TASK
 
 WORLDS = 64
 LAST = 10
@@ -52,19 +53,19 @@ CONFIG = TrainConfig(
     iterations=60,
     save_interval=1000,
 )
-_MINUTES = RECIPES["minutes"].config.task
 RECIPE = replace(
     CONFIG,
     task=replace(
-        _MINUTES,
-        action=replace(_MINUTES.action, arm_step=0.02, hand_zero="home"),
-        observation=replace(_MINUTES.observation, cloud_points=8),
+        TASK,
+        randomization=RandomizationConfig(),
+        action=replace(TASK.action, arm_step=0.02, hand_zero="home"),
+        observation=replace(TASK.observation, cloud_points=8),
         termination=CONFIG.task.termination,
         reset=CONFIG.task.reset,
         distance_points=32,
     ),
 )
-"""The same training in the task of the recipe ``minutes``: control at 30 Hz, paired points, its actions and rewards."""
+"""The same training in the default task without random properties: control at 30 Hz, paired points, its actions and rewards."""
 
 
 def shares(mean):

@@ -74,11 +74,11 @@ def train(
         minutes: time of the whole training, without compiling kernels: a run that continues has the rest of it. With
             iterations and minutes, the training ends with what is reached first.
         seed: seed of every random number; default: 0.
-        recipe: where the configuration starts from: a recipe (default, robust, minutes, any_object, live, paper,
-            published), a TOML file of your own with the tables that it changes (docs/clusters.md), or another run's
-            folder, or a policy. Options --config.* change it; see them with xreset train --help-config [PART]. Reward
-            terms of your own are not taken from a file or a run; name them again. Default: the recipe of the headline
-            results; with weights, that of the weights.
+        recipe: where the configuration starts from: a recipe (default, any_object, live, paper, published), a TOML file
+            of your own with the tables that it changes (docs/clusters.md), or another run's folder, or a policy.
+            Options --config.* change it; see them with xreset train --help-config [PART]. Reward terms of your own are
+            not taken from a file or a run; name them again. Default: the recipe of the headline results; with weights,
+            that of the weights.
         weights: another run's folder: start with the networks of its newest checkpoint, including the standard
             deviation of the actions and the learning rate. Or an exported policy (.onnx), or the name of one that ships
             with xreset: it has no critic, so a new one learns alone in the first iterations.

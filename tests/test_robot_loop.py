@@ -157,7 +157,7 @@ class VerdictTest(TestCase):
 class StoppedTest(InFolder):
     def test_an_episode_is_measured_to_its_end_although_its_robot_has_stopped(self):
         """Its object may go on moving. With other robots that go on, its episode goes on anyway."""
-        demos = upright(SOUP, 1)
+        demos = upright(SOUP, 1, seed=1)
         policy = load_policy("soup-can")
         steps = round(policy.task.termination.episode_seconds / policy.task.control_dt)
         measure = Round.update_metrics
@@ -172,7 +172,7 @@ class StoppedTest(InFolder):
 class CommandTest(InFolder):
     def test_a_verdict_from_the_command_line(self):
         demos = self.folder / "demos.npz"
-        write_demos(demos, upright(SOUP, 1))
+        write_demos(demos, upright(SOUP, 1, seed=1))
         policy = shipped()["soup-can"]
         options = ("--demos", demos, "--engine mujoco --episodes 1 --out", self.folder)
         faults = "--property published-faults=0.5 --property lost-frames=1.2"

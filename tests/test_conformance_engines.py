@@ -1,9 +1,9 @@
 """Every engine of the project keeps the contracts, with the suite's own robot and with another one."""
 
-import unittest
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from unittest import TestCase
 
 import numpy as np
 
@@ -14,7 +14,6 @@ from xreset.geometry.description import load_robot, read_description
 from xreset.geometry.dynamics import drive_inertia
 from xreset.physics.plugins import backend_status, make_backend
 
-BACKENDS = ("mujoco", "mujoco-warp", "pybullet", "sapien")
 ROBOT_DEPENDENT = [check.name for check in CHECKS if check.group == "state"]
 ROBOT_DEPENDENT += ["mass_properties", "joint_limits", "gravity_compensation"]
 """Checks of what an engine reads from a robot's description. How its drives pull does not depend on the robot."""
@@ -50,31 +49,49 @@ def panda():
     return replace(robot, joints=tuple(joints))
 
 
-class EveryBackend(unittest.TestCase):
-    def passes(self, backend, **options):
-        status = backend_status(backend)
-        if status.reason is not None:
-            self.skipTest(f"{backend}: {status.reason}")
-        results = run(make_local(backend), **options)
+class EngineChecks:
+    """The checks of one engine."""
+
+    engine: str
+
+    def setUp(self):
+        if reason := backend_status(self.engine).reason:
+            self.skipTest(reason)
+
+    def passes(self, **options):
+        results = run(make_local(self.engine), **options)
         self.assertEqual(
             [explain(r) for r in results if r.verdict not in ("passed", "known difference")], []
         )
 
-    def test_every_backend_passes(self):
-        for backend in BACKENDS:
-            with self.subTest(backend=backend):
-                self.passes(backend)
+    def test_it_passes(self):
+        self.passes()
 
     def test_couplings_below_their_source_make_no_work(self):
-        for backend in BACKENDS:
-            with self.subTest(backend=backend):
-                self.passes(backend, robot=load_robot("ur7e-robotiq"), only=["coupled_jaw"])
+        self.passes(robot=load_robot("ur7e-robotiq"), only=["coupled_jaw"])
 
     @PYBULLET  # whose data package has the robot
     def test_a_robot_of_another_package(self):
-        for backend in BACKENDS:
-            with self.subTest(backend=backend):
-                self.passes(backend, robot=panda(), only=ROBOT_DEPENDENT)
+        self.passes(robot=panda(), only=ROBOT_DEPENDENT)
+
+
+class MujocoTest(EngineChecks, TestCase):
+    engine = "mujoco"
+
+    @PYBULLET  # whose data package has the robot
+    def test_checks_of_the_suite_s_own_robot_are_skipped(self):
         own = [check.name for check in CHECKS if check.own_robot_only]
         results = run(make_local("mujoco"), robot=panda(), only=own)
         self.assertEqual({result.verdict for result in results}, {"skipped"})
+
+
+class MujocoWarpTest(EngineChecks, TestCase):
+    engine = "mujoco-warp"
+
+
+class PybulletTest(EngineChecks, TestCase):
+    engine = "pybullet"
+
+
+class SapienTest(EngineChecks, TestCase):
+    engine = "sapien"

@@ -15,7 +15,7 @@ from numpy.testing import assert_allclose
 from xreset.backends import mujoco_warp_depth, mujoco_warp_step
 from xreset.backends.conformance.scene import scene
 from xreset.backends.mujoco_warp import MujocoWarpBackend
-from xreset.backends.mujoco_warp_setup import correct_engine, engine_step
+from xreset.backends.mujoco_warp_setup import CPU_FLAGS, correct_engine, engine_step
 from xreset.physics.torch_warp import quiet
 
 WORLDS = 200
@@ -54,7 +54,8 @@ def poses(rng):
 
 class Depth(TestCase):
     def test_contacts_that_were_clipped_to_one_are_as_deep_as_in_mujoco(self):
-        correct_engine()  # tested is the engine as the backend leaves it
+        correct_engine()  # tested is the engine as the backend leaves it, with its kernels
+        self.enterContext(patch.object(wp.config, "cpu_compiler_flags", CPU_FLAGS))
         model = across_an_edge()
         qpos = poses(np.random.default_rng(0))
         with wp.ScopedDevice("cpu"):

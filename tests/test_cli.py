@@ -99,8 +99,8 @@ class LightnessTest(TestCase):
 
     def test_a_misspelt_fault_or_property_is_refused_before_anything_heavy_is_loaded(self):
         for words in (
-            "stress soup-can --faults --property pose-dely",
-            "stress soup-can --demos x.npz --property pose-dely",
+            "stress many-objects --faults --property pose-dely",
+            "stress many-objects --demos x.npz --property pose-dely",
         ):
             code = (
                 "from xreset.cli import main\n"

@@ -47,7 +47,7 @@ from xreset.runtime import Controller, LiveError, Reading, load_controller
 from xreset.runtime.contract import KEY, parse_contract
 from xreset.task.config import ObservationConfig, evaluation_task
 
-POLICY = "soup-can"
+POLICY = "many-objects"
 STEPS = 30
 REPLAY = """
 import json, sys
@@ -106,7 +106,7 @@ def recorded(name, object_name, steps):
 class RuntimeTest(InFolder):
     def test_it_acts_as_the_evaluation_in_a_process_without_xreset(self):
         said = succeeds("export deploy", POLICY, "--out", f"{self.folder}/can")
-        self.assertIn("28 joints at 60 Hz", said)
+        self.assertIn("28 joints at 30 Hz", said)
         np.savez(f"{self.folder}/recording.npz", object=SOUP, **recorded(POLICY, SOUP, STEPS))
         command = [sys.executable, "-I", "-c", REPLAY]
         command += [f"{self.folder}/can", f"{self.folder}/recording.npz"]
@@ -187,7 +187,7 @@ class ToyTest(InFolder):
             mock.patch("xreset.eval.policy_spec.load_policy", side_effect=AssertionError),
             self.assertRaisesRegex(XResetError, "is there already"),
         ):
-            export_deploy("soup-can", self.out)
+            export_deploy("many-objects", self.out)
         with self.assertRaisesRegex(
             LiveError, "has no object 'hat'. Choose from: brick.*--object NAME"
         ):

@@ -167,21 +167,21 @@ class FromABankTest(InOneFolder):
         with self.environment(1) as env:
             for arguments, message in (
                 (
-                    ("soup-can", env, "film.mp4"),
-                    "soup-can is a policy of the robot 'ur7e-sharpa', not of 'openarm'",
+                    ("many-objects", env, "film.mp4"),
+                    "many-objects is a policy of the robot 'ur7e-sharpa', not of 'openarm'",
                 ),
                 (("no-such-policy", env, "film.mp4"), "no-such-policy"),
                 (
-                    ("soup-can", env, "film.gif"),
+                    ("many-objects", env, "film.gif"),
                     "^path is 'film.gif', expected a name that ends in .mp4",
                 ),
             ):
                 with refuses(self, message, xreset.XResetError):
                     xreset.film(*arguments)
             with self.assertRaisesRegex(xreset.XResetError, "World 1 does not exist"):
-                xreset.film("soup-can", env, "film.mp4", world=1)
+                xreset.film("many-objects", env, "film.mp4", world=1)
             with self.assertRaisesRegex(xreset.XResetError, "fps is 0, expected a number above"):
-                xreset.film("soup-can", env, "film.mp4", fps=0)
+                xreset.film("many-objects", env, "film.mp4", fps=0)
 
     def test_other_learning_code_trains(self):
         self.assertRegex(run("10_gymnasium", self.bank), r"iteration 3: reward per step -?\d")

@@ -78,10 +78,10 @@ class Episodes(Case):
         assert_array_equal(table["trace"][0].joint_pos.shape, (5, len(self.robot.joints)))
 
     def test_a_training_is_found_by_what_names_it(self):
-        results = self.evaluate("runs/soup-can")
+        results = self.evaluate("runs/many-objects")
         self.assertEqual(len(read_training(self.folder, results=str(results / "eval")).results), 2)
-        with chdir(self.folder):  # as xreset eval soup-can writes them
-            self.assertEqual(len(read_training("soup-can").results), 2)
+        with chdir(self.folder):  # as xreset eval many-objects writes them
+            self.assertEqual(len(read_training("many-objects").results), 2)
         file = self.folder / "a.txt"
         file.write_text("")
         with self.assertRaisesRegex(RunError, "a.txt is not a folder. Give a run folder"):

@@ -204,7 +204,7 @@ class InputsTest(InOneFolder):
             (make_bank, {"retargeted": motion} | scene, {"num_envs": 0}, counts),
             (evaluate, playing, {"seed": 2**32}, seeds),
             (make_env, {"bank": bank} | scene, {"seed": np.random.default_rng()}, seeds),
-            (stress, {"policy": "soup-can", "demos": bank}, {"episodes": 0}, counts),
+            (stress, {"policy": "many-objects", "demos": bank}, {"episodes": 0}, counts),
         ):
             with (
                 self.subTest(call.__name__, **wrong),

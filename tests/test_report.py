@@ -204,7 +204,7 @@ class CollectTest(Reported):
 
     def test_a_teacher_that_played_other_episodes_is_not_compared(self):
         self.write(("mujoco",))
-        self.write_run("", teacher="soup-can")
+        self.write_run("", teacher="many-objects")
         for engine in (None, "sapien", "mujoco"):
             if engine is not None:
                 self.write_teacher(engine)

@@ -158,7 +158,7 @@ class StoppedTest(InFolder):
     def test_an_episode_is_measured_to_its_end_although_its_robot_has_stopped(self):
         """Its object may go on moving. With other robots that go on, its episode goes on anyway."""
         demos = upright(SOUP, 1, seed=1)
-        policy = load_policy("soup-can")
+        policy = load_policy("many-objects")
         steps = round(policy.task.termination.episode_seconds / policy.task.control_dt)
         measure = Round.update_metrics
         with patch.object(Round, "update_metrics", autospec=True, side_effect=measure) as measured:
@@ -173,7 +173,7 @@ class CommandTest(InFolder):
     def test_a_verdict_from_the_command_line(self):
         demos = self.folder / "demos.npz"
         write_demos(demos, upright(SOUP, 1, seed=1))
-        policy = shipped()["soup-can"]
+        policy = shipped()["many-objects"]
         options = ("--demos", demos, "--engine mujoco --episodes 1 --out", self.folder)
         faults = "--property published-faults=0.5 --property lost-frames=1.2"
         out = succeeds("stress", policy, *options, faults)
@@ -186,7 +186,7 @@ class CommandTest(InFolder):
         before = (self.folder / "mujoco.json").read_bytes()
         rolled = "xreset.eval.robot_loop.roll_out_on_robot"
         with patch(rolled, side_effect=KeyboardInterrupt), self.assertRaises(KeyboardInterrupt):
-            stress("soup-can", demos, properties="pose-delay=1", out=self.folder)
+            stress("many-objects", demos, properties="pose-delay=1", out=self.folder)
         after = (self.folder / "mujoco.json").read_bytes()
         self.assertEqual(after, before, "results of a whole sweep stay")
         earlier = xreset("rehearse", policy, *options, "--fault pose-delay=200")
@@ -201,4 +201,4 @@ class CommandTest(InFolder):
             stress("zero", demos, robot="openarm", faults=True)
         late = ("action-latency", "lost-frames")
         with self.assertRaisesRegex(XResetError, "Choose action-delay in place of action-latency"):
-            stress("soup-can", demos, properties=late, out=self.folder)
+            stress("many-objects", demos, properties=late, out=self.folder)

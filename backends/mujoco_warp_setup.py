@@ -29,7 +29,7 @@ from xreset.backends.workers import usable_cores
 _TESTED = "4.0.0"
 """Version of MuJoCo-Warp with which depths of contacts and the order of a step were tested."""
 CPU_FLAGS = "-march=native"
-"""Flags of the compiler for the CPU. Warp's own flags inline forty times as much: kernels take half as long again to
+"""Flags of the compiler for the CPU. Warp's own flags inline forty times as much: kernels take 1.5 times as long to
 compile, and are no faster."""
 _ANNOUNCE_AFTER = 3.0
 """Seconds after which the wait for kernels is explained. From the cache they take less."""

@@ -1,8 +1,9 @@
 """learning: whether a small training learns as it did, as JSON with the stored band (ci/learning.json); exit status 1 if it does not.
 
-A gripper takes a brick between its jaws and lifts it (tests/toy_learning.py), in the default task without random properties, or with --task small in the one
-of the tests (60 Hz, one cloud). --device cpu: MuJoCo, 60 iterations, 40 seconds. --device cuda: mujoco-warp, the paper's networks in bfloat16, as
-many iterations on every GPU; three minutes with compiling.
+A gripper takes a brick between its jaws and lifts it (tests/toy_learning.py), in the default task without random
+properties, or with --task small in the one of the tests (60 Hz, one cloud). --device cpu: MuJoCo, 60 iterations, 40
+seconds. --device cuda: mujoco-warp, the paper's networks in bfloat16, as many iterations on every GPU; three minutes
+with compiling.
 """
 
 from __future__ import annotations

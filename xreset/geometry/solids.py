@@ -6,9 +6,7 @@ out.
 
 from __future__ import annotations
 
-import pickle
 from collections.abc import Sequence
-from functools import lru_cache
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -29,17 +27,11 @@ _SAMPLES = 2e-3
 
 
 def link_field(shapes: Sequence[Shape]) -> DistanceFields:
-    """Return the signed distance to a link's shapes as one solid, in the link's frame, sampled once in a process.
+    """Sample the signed distance to a link's shapes as one solid, in the link's frame.
 
     The gaps are closed as in mathematical morphology: what a ball of diameter :data:`GAP` outside the shapes cannot
     reach is inside. Flat and convex surfaces stay in place.
     """
-    return _sampled(pickle.dumps(shapes))  # fingers of a hand are often alike
-
-
-@lru_cache(maxsize=64)
-def _sampled(pickled_shapes: bytes) -> DistanceFields:
-    shapes = pickle.loads(pickled_shapes)
     support = [support_points(shape) for shape in shapes]
     low = np.min([points.min(axis=0) - radius for points, radius in support], axis=0)
     high = np.max([points.max(axis=0) + radius for points, radius in support], axis=0)

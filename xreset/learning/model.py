@@ -227,10 +227,6 @@ class PointNetLstmModel(MLPModel):
     In a rollout the model keeps its own LSTM state. In an update it gets whole rollouts [T, N, ...] of some worlds, the
     state with which each piece starts, and ``masks`` [T, N], True where a step is the first of an episode. There the
     state is zeroed, so gradients cross neither the end of an episode nor that of a piece.
-
-    Attributes:
-        keeps_normalization: whether new observations leave mean and variance as they are, as in an actor that learns on
-            (docs/lab-book.md, "A policy that learns on").
     """
 
     is_recurrent: bool = True
@@ -278,7 +274,6 @@ class PointNetLstmModel(MLPModel):
             width *= shape[0]
         self.trunk = Trunk(self.obs_dim, encoder, width, config.lstm, clip=clip)
         self.state: LstmState | None = None
-        self.keeps_normalization = False
 
     def forward(self, obs: TensorDict, *args: Any, **options: Any) -> Tensor:
         """[..., outputs]; an actor's actions are masked by the observation ``action_mask``, if there is one."""
@@ -344,9 +339,7 @@ class PointNetLstmModel(MLPModel):
         return self.state
 
     def update_normalization(self, obs: TensorDict) -> None:
-        """Take observations [M, ...] into the running mean and variance, unless they are to stay as they are."""
-        if self.keeps_normalization:
-            return
+        """Take observations [M, ...] into the running mean and variance."""
         normalizer = self.trunk.normalizer
         std = normalizer._std  # rsl-rl replaces this tensor; captured updates read it where it is
         normalizer.update(torch.cat([obs[group] for group in self.obs_groups], dim=-1))

@@ -450,7 +450,8 @@ def run_training(
         elif info.weights is not None:
             runner.load_networks(Path(info.weights))
         if info.weights is not None:
-            runner.alg.networks["actor"].keeps_normalization = True
+            # new observations leave its mean and variance as they are (docs/lab-book.md, "A policy that learns on")
+            runner.alg.networks["actor"].trunk.normalizer.until = 0
         runner.critic_iterations = CRITIC_ITERATIONS if learns_on else 0
         if processes.is_main:
             _write_start(out, info, runner.iteration, is_new=newest is None, resumed=resumed)

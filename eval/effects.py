@@ -12,7 +12,7 @@ import numpy as np
 from xreset.eval.conditions import Property, property_of
 from xreset.eval.plots import COLORS, svg
 from xreset.eval.results import EvalResult
-from xreset.eval.stats import Interval, Table, bootstrap_ci95, mean
+from xreset.eval.stats import Interval, Table, bootstrap_ci95, least_p, mean
 from xreset.files.checks import frozen
 
 if TYPE_CHECKING:
@@ -42,16 +42,24 @@ class Effect:
     task_progress: float
     difference: float
     difference_ci95: Interval
+    demonstrations_suffice: bool
+    """Whether there are enough of them to tell a loss in all from chance, six or more."""
+
+    def loses_more_than(self, most: float) -> bool:
+        """Whether the loss is above a number, and that is not chance."""
+        return self.demonstrations_suffice and -self.difference_ci95[1] > most
 
 
 def effect(episodes: Table, nominal: Table, value: float) -> Effect:
     """Compare episodes one by one with the same episodes unchanged. The interval is a bootstrap over demonstrations."""
     difference = episodes["task_progress"].to_numpy() - nominal["task_progress"].to_numpy()
+    demonstrations = episodes["sequence"].to_numpy()
     return Effect(
         value=value,
         task_progress=mean(episodes, "task_progress"),
         difference=float(difference.mean()),
-        difference_ci95=bootstrap_ci95(difference, episodes["sequence"].to_numpy()),
+        difference_ci95=bootstrap_ci95(difference, demonstrations),
+        demonstrations_suffice=least_p(difference, demonstrations) <= 0.05,
     )
 
 
@@ -83,7 +91,7 @@ class Curve:
         else:
             beyond = [p for p in self.points if p.value >= limit]
         nearest = min(beyond, key=lambda p: abs(p.value - limit))
-        return nearest.difference_ci95[1] < 0
+        return nearest.loses_more_than(0.0)
 
 
 def curves(result: EvalResult) -> list[Curve]:
@@ -150,7 +158,7 @@ def verdict(results: Sequence[EvalResult]) -> tuple[str, list[str]]:
                 f"{-100 * point.difference:.1f} points (95 %: {round(low)} to {round(high)}). "
                 f"At most {100 * most:.0f} are wanted."
             )
-            reasons = against if low > 100 * most else unsure
+            reasons = against if point.loses_more_than(most) else unsure
             reasons.append(text)
     changed = set(chain.from_iterable(result.changed["property"].unique() for result in results))
     if not changed & {option for option, _, _ in CRITERIA}:
@@ -159,7 +167,7 @@ def verdict(results: Sequence[EvalResult]) -> tuple[str, list[str]]:
     if against:
         sentence = "Not ready for a robot."
     elif unsure:
-        sentence = "Not shown to be ready: some losses may be too large. Play more episodes."
+        sentence = "Not shown to be ready: some losses may be too large. Play more demonstrations."
     elif tried < len(CRITERIA) * len(results):
         sentence = "No verdict: not every fault that decides was tried."
     return sentence, [*against, *unsure]

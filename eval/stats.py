@@ -132,12 +132,16 @@ def difference_ci95(one: Sequence[np.ndarray], other: Sequence[np.ndarray]) -> I
 
 def difference_p(one: Sequence[np.ndarray], other: Sequence[np.ndarray]) -> float:
     """Return the two-sided p value of equal means: twice the share of the draws of :func:`difference_ci95` on the
-    smaller side of zero, where one more draw counts as a tie. It is at least 0.001; and for n demonstrations 2^(1 - n),
-    the chance that all of them differ in the same direction."""
+    smaller side of zero, where one more draw counts as a tie. It is at least 0.001, and at least :func:`least_p`."""
     differences = _mean_differences(one, other)
     fewer = min((differences <= 0).sum(), (differences >= 0).sum())
-    least = 2.0 ** (1 - _independent(one[0], one[2]))
-    return min(1.0, max(2 * float(fewer + 1) / (DRAWS + 1), least))
+    return min(1.0, max(2 * float(fewer + 1) / (DRAWS + 1), least_p(one[0], one[2])))
+
+
+def least_p(values: np.ndarray, groups: np.ndarray) -> float:
+    """Return the least p value that values [E] of n demonstrations [E] can show: 2^(1 - n), the chance that all of them
+    differ in the same direction."""
+    return 2.0 ** (1 - _independent(values, groups))
 
 
 def holm(p_values: Sequence[float]) -> list[bool]:

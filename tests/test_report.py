@@ -239,11 +239,11 @@ class CollectTest(Reported):
     def test_the_page_has_what_it_tolerates(self):
         policy = {"policy": "ab12"}
         self.write(inputs=policy)
-        sweep = {("force-gain", 2.0): [0.2, 0.2, 1.0, 1.0]}
-        lost = {("pose-delay", 0.2): [0.1] * 4}
+        sweep = {("force-gain", 2.0): 3 * [0.2, 0.2, 1.0, 1.0]}
+        lost = {("pose-delay", 0.2): [0.1] * 12}
         stopped = {"The pose is old.": 2}
         for name, conditions in (("stress", sweep), ("faults", lost)):
-            found = swept([0.8] * 4, conditions, inputs=policy, stopped=stopped)
+            found = swept([0.8] * 12, conditions, inputs=policy, stopped=stopped)
             write_result(self.folder / name, found, (), ())
         # cards of 0.1 to 0.3 had no episodes
         (self.folder / "stress" / "sapien.json").write_text('{"schema": "xreset-stress/1"}')

@@ -133,8 +133,8 @@ class VerdictTest(TestCase):
             name = prop.option.replace("-", "_")
             for i, value in enumerate(prop.values):
                 loss = losses.get(f"{name}_{i}", 0.0)
-                sweep[prop.option, value] = [progress - loss] * 5
-        return swept([progress] * 5, sweep, engine)
+                sweep[prop.option, value] = [progress - loss] * 12
+        return swept([progress] * 12, sweep, engine)
 
     def test_verdicts(self):
         ready = ("Ready for a first, careful trial on a robot.", [])
@@ -144,8 +144,8 @@ class VerdictTest(TestCase):
         self.assertEqual(sentence, "Not ready for a robot.")
         words = "sapien: action delay 0.067 s costs 20.0 points .95 %: 20 to 20.. At most 4"
         self.assertRegex(reasons[0], words)
-        scattered = {("pose-delay", 0.2): [0.4, 0.4, 0.9, 0.9, 0.9]}
-        sentence, reasons = verdict([swept([0.8] * 5, scattered)])
+        scattered = {("pose-delay", 0.2): [0.4] * 4 + [0.85] * 8}
+        sentence, reasons = verdict([swept([0.8] * 12, scattered)])
         self.assertIn("Not shown to be ready", sentence)
         self.assertRegex(reasons[0], r"costs 10.0 points .95 %: -\d+ to \d+.")
         _, reasons = verdict([self.result(progress=0.3)])

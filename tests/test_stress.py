@@ -13,7 +13,7 @@ from tests.toy_bank import SOUP
 from tests.toy_results import swept
 from xreset.errors import XResetError
 from xreset.eval.conditions import PROPERTIES, SWEPT, chosen_properties, nominal_task
-from xreset.eval.effects import by_property, curves
+from xreset.eval.effects import by_property, curves, verdict
 from xreset.eval.results import read_evaluation
 from xreset.files.storage import claim
 from xreset.task.config import RandomizationConfig, TaskConfig, evaluation_task
@@ -87,13 +87,13 @@ class StressedTest(TestCase):
 
 class CurveTest(TestCase):
     def test_the_limit_is_interpolated_between_tried_values(self):
-        base = [1.0, 0.6, 0.8, 0.8]
+        base = 3 * [1.0, 0.6, 0.8, 0.8]
         sweep = {}
         for option, changes in (
             ("arm-stiffness", {0.5: -0.3, 0.8: -0.05, 1.5: -0.02, 2.0: -0.08}),
             ("action-latency", {0.01: -0.15, 0.02: -0.3}),
             ("object-mass", {0.5: 0.0, 2.0: 0.0}),
-            ("force-gain", {2.0: [-0.6, -0.6, 0.2, 0.2]}),
+            ("force-gain", {2.0: 3 * [-0.6, -0.6, 0.2, 0.2]}),
         ):
             for value, change in changes.items():
                 sweep[option, value] = np.add(base, change).tolist()
@@ -110,13 +110,28 @@ class CurveTest(TestCase):
         self.assertEqual(scattered.costs(), "x 1.5, or chance")
         self.assertEqual((late.costs(), harmless.costs()), ("0.0067 s", "no tested value"))
 
+    def test_few_demonstrations_may_lose_by_chance(self):
+        """Two lose in the same direction every second time."""
+        for demonstrations, costs, verdict_begins in (
+            (2, "0.029 s, or chance", "Not shown to be ready"),
+            (5, "0.029 s, or chance", "Not shown to be ready"),
+            (6, "0.029 s", "Not ready for a robot"),
+        ):
+            with self.subTest(demonstrations):
+                count = 2 * demonstrations
+                found = swept([0.8] * count, {("pose-delay", 0.2): [0.1] * count})
+                self.assertEqual(curves(found)[0].costs(), costs)
+                sentence, reasons = verdict([found])
+                self.assertTrue(sentence.startswith(verdict_begins), sentence)
+                self.assertIn("costs 70.0 points", reasons[0])
+
     def test_every_engine_has_its_own_curves(self):
         one = swept([0.8] * 2, {("effort", 0.4): [0.2] * 2})
         other = swept([0.8] * 2, {}, "sapien")
         found = by_property([other, one])
         self.assertEqual([curve is None for curve in found["effort"]], [True, False])
         unknown = swept([0.8] * 2, {("of-a-later-version", 3.0): [0.2] * 2})
-        self.assertEqual(curves(unknown)[0].costs(), "1.3")
+        self.assertEqual(curves(unknown)[0].costs(), "1.3, or chance")
 
     def test_names_are_unique(self):
         self.assertEqual(len({prop.option for prop in PROPERTIES}), len(PROPERTIES))

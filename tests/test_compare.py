@@ -500,6 +500,29 @@ class FairnessTest(Compared):
         self.run_and_results("usual")
         expected = r"not the same task.termination.episode_seconds \(2.5: short; 5: usual\)"
         self.assertRegex(self.compare("short", "usual"), expected)
+        task = TrainConfig().task
+        surfaces = task.randomization
+        for name, changes, words in (
+            ("frame", {"object_frame": "center"}, r"object_frame \(center: frame; mesh: usual\)"),
+            (
+                "rough",
+                {"randomization": replace(surfaces, friction=(1.0, 1.5))},
+                "friction .1.25: ",
+            ),
+            ("soft", {"randomization": replace(surfaces, elastomer=1.2)}, "elastomer .1.2: soft; "),
+            (
+                "slow",
+                {"timestep": 0.02, "substeps": 1},
+                r"timestep \(0.02: slow; 0.00416667: usual",
+            ),
+            ("wide", {"randomization": replace(surfaces, friction=(0.2, 1.3))}, ""),
+            ("fine", {"timestep": 1 / 960, "substeps": 8}, ""),
+        ):
+            with self.subTest(name):
+                self.run_and_results(name, config=TrainConfig(task=replace(task, **changes)))
+                text = self.compare(name, "usual")
+                self.assertRegex(text, words or name)
+                self.assertEqual("not comparable" in text, bool(words))
 
     def test_episodes_of_another_length(self):
         """The length of an evaluation counts, and not that of the training, if the result states it."""

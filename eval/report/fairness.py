@@ -14,11 +14,15 @@ from xreset.eval.results import read_evaluation
 from xreset.eval.stats import Table
 from xreset.files.text import quantity, short_name
 from xreset.learning.run import TEACHER
+from xreset.task.config import evaluation_task
 
 _CONDITIONS = ("objects", "object meshes", "number of episodes", "seed of the evaluation")
 _OF_ONE_TRAINING = ("robot", "policy", "policy file")
 """Conditions in which the results of one training agree. Trainings may differ in them: they are what is compared."""
-_PLAYED_TASK = ("task.termination.", "task.reset.spawn_", "task.timestep")
+_PLAYED_TASK = (
+    "task.termination.", "task.reset.spawn_", "task.object_frame", "task.randomization.elastomer",
+    "task.randomization.metal", "task.randomization.table",
+)  # fmt: skip
 """Fields of a training's task that make its evaluation easier or harder, because the evaluation keeps them
 (:func:`xreset.task.config.evaluation_task`). An evaluation may only change the length of episodes."""
 _LENGTH = "task.termination.episode_seconds"
@@ -89,7 +93,7 @@ def uneven(trainings: Sequence[Training]) -> list[str]:
     table = _condition_table(trainings)
     if table.empty:
         return []
-    tasks = sorted(name for name in table if name.startswith(_PLAYED_TASK))
+    tasks = sorted(name for name in table if name.startswith("task."))
     found = []
     of_one = _OF_ONE_TRAINING if len(trainings) == 1 else ()
     for name in (*_CONDITIONS, *tasks, *of_one):
@@ -128,13 +132,22 @@ def _condition_table(trainings: Sequence[Training]) -> Table:
                 "number of episodes": len(result.nominal),
                 "seed of the evaluation": result.seed,
             }
-            for name, text in training.facts.items():
-                if name.startswith(_PLAYED_TASK):
-                    row[name] = text
+            row |= _played_task(training)
             if result.episode_seconds is not None:  # may differ from the training's
                 row[_LENGTH] = f"{result.episode_seconds:.6g}"
             rows.append(row)
     return pd.DataFrame(rows)
+
+
+def _played_task(training: Training) -> dict[str, str]:
+    """Return what evaluations keep of a training's task, by name, as text. They have the mean of its range of friction,
+    and a timestep of their own unless the time between actions does not allow it."""
+    kept = {name: x for name, x in training.facts.items() if name.startswith(_PLAYED_TASK)}
+    if training.run is not None:
+        task = evaluation_task(training.run.config.task)
+        kept["task.timestep"] = f"{task.timestep:.6g}"
+        kept["task.randomization.friction"] = f"{sum(task.randomization.friction) / 2:.6g}"
+    return kept
 
 
 def _difference(table: Table, column: str, what: str, advice: str = "") -> list[str]:

@@ -415,18 +415,20 @@ class ScoreTest(Compared):
 
     def test_the_difference_of_two_evaluations(self):
         base = toy_rollouts()
+        base = replace(base, episodes=tuple(replace(e, turn=1.0) for e in base.episodes))
         worse = [replace(e, task_progress=0.5 * e.task_progress) for e in base.episodes]
         for name, episodes, changes in (
             ("good", base.episodes, {}),
             ("bad", tuple(worse), {}),
             ("seed", base.episodes, {"seed": 4}),
             ("fewer", base.episodes[::2], {}),
+            ("goals", tuple(replace(e, turn=e.turn + 0.1) for e in base.episodes), {}),
             ("sapien", base.episodes, {"engines": ("sapien",)}),
         ):
             self.write_results(name, replace(base, episodes=episodes), **changes)
         good, bad, *others = (
             read_evaluation(self.folder / name / "eval")
-            for name in ("good", "bad", "seed", "fewer")
+            for name in ("good", "bad", "seed", "fewer", "goals")
         )
         table = good.minus(bad).query("metric == 'task_progress'").set_index(["engine", "object"])
         self.assertEqual([*table.loc["mujoco"].index], ["all", SOUP, SPAM])

@@ -337,6 +337,16 @@ class ResetTest(WithEnv):
         expected[env.sequence[0]] += 0.05
         env.step(torch.zeros(N, 7))
         assert_close(env.resets.success_rate, expected)
+        # as at the start of a training, and after each break
+        env.resets.success_rate.fill_(1.0)
+        env.episode_length_buf = torch.full((N,), env.max_episode_length - 1)
+        _, _, done, _ = env.step(torch.zeros(N, 7))
+        self.assertTrue(done.all())
+        assert_close(env.resets.success_rate, torch.ones(3), msg="the episodes were cut short")
+        env.episode_length_buf[:] = env.max_episode_length - 1
+        env.goal_pos += 0.3
+        env.step(torch.zeros(N, 7))
+        self.assertLess(float(env.resets.success_rate.min()), 1.0)
 
     def test_starts_come_from_the_distribution_and_may_press(self):
         """Drives begin with the bank's targets; from home they hold the joints."""

@@ -106,6 +106,20 @@ class CurvesTest(InFolder):
         TrainingLog(self.folder, 2, "cpu", 5, done=4).close()
         self.assertEqual(read_lift(self.folder), done)
 
+    def test_episodes_that_a_break_cuts_short_are_in_no_curve(self):
+        """World 0 ends after two steps, and after three more; world 1 after four."""
+        for done, expected in ((0, [2.0, 3.0]), (4, [3.0])):
+            folder = self.folder / str(done)
+            log = TrainingLog(folder, 2, "cpu", None, done=done)
+            for iteration, ends in enumerate(([(0, 0), (1, 0)], [(0, 0), (0, 1), (1, 0)])):
+                for end in ends:
+                    log.add(torch.ones(2), torch.tensor(end), LOG)
+                log.write(done + iteration, 10, 60.0, {"speed/env_steps_per_second": 2.0})
+            log.close()
+            curves = read_curves(folder)
+            for name in ("episode/length", "episode/return"):
+                self.assertEqual(curves[name].dropna().tolist(), expected)
+
     def test_each_iteration_is_on_disk_at_once_and_open_logs_share_nothing(self):
         hook = threading.excepthook
         threads = threading.active_count()

@@ -214,6 +214,8 @@ class ManipulationEnv:
         """[N] bool: an action of the episode was not finite."""
         self._over = keep("over", no_world.clone())
         """[N] bool: the episode is over, and the world waits for its reset."""
+        self._is_cut = keep("is_cut", no_world.clone())
+        """[N] bool: the episode has less time than others, because its length was assigned."""
         self.nonfinite_count = torch.zeros((), dtype=torch.long, device=self.device)
         self.overflow_count = self.nonfinite_count.clone()
         # What follows is written anew in each step.
@@ -256,12 +258,14 @@ class ManipulationEnv:
 
     @property
     def episode_length_buf(self) -> Tensor:
-        """[N] control steps since each world's reset. Assigned values are copied into the buffer."""
+        """[N] control steps since each world's reset. Assigned values are copied into the buffer; an episode that they
+        cut short is no try of its demonstration."""
         return self._episode_length
 
     @episode_length_buf.setter
     def episode_length_buf(self, value: Tensor) -> None:
         self._episode_length.copy_(value)
+        self._is_cut.copy_(value > 0)
 
     @property
     def from_bank(self) -> Tensor:
@@ -470,7 +474,7 @@ class ManipulationEnv:
         self._time_out.copy_(time_out & ~lost)
         self._reset_mask.copy_((lost | time_out) & ~self._over)
         if self.resets.config.adaptive_share:
-            ended = self._reset_mask & ~self.from_bank & ~self._faulty
+            ended = self._reset_mask & ~self.from_bank & ~self._faulty & ~self._is_cut
             self.resets.record(self.sequence, success, ended)
 
     def _mark_faults(self, reading: Reading) -> None:
@@ -531,7 +535,7 @@ class ManipulationEnv:
         self.worlds.draw(fresh, self.generator)
         self._episode.map(Tensor.copy_, where(fresh, start, self._episode))
         self._previous_action.masked_fill_(fresh[:, None], 0)
-        for cleared in (self._episode_length, self._reward, self._over):
+        for cleared in (self._episode_length, self._reward, self._over, self._is_cut):
             cleared.masked_fill_(fresh, 0)
 
     def _write_resets(self) -> None:

@@ -74,6 +74,8 @@ class TrainingLog:
             self._curves = _EventFile(folder)
         self._returns = torch.zeros(num_envs, device=device)
         self._lengths = torch.zeros(num_envs, device=device)
+        # after a break, the first episode of each world is cut short, and its return would be a dent in the curve
+        self._counts = torch.full((num_envs,), float(done == 0), device=device)
         # sum of returns, sum of lengths, number of episodes
         self._finished = torch.zeros(3, device=device)
         self._recent: deque[list[float]] = deque(maxlen=RECENT)
@@ -90,9 +92,11 @@ class TrainingLog:
         ended = done.float()
         self._returns += reward
         self._lengths += 1
+        counted = ended * self._counts
         self._finished += torch.stack(
-            ((self._returns * ended).sum(), (self._lengths * ended).sum(), ended.sum())
+            ((self._returns * counted).sum(), (self._lengths * counted).sum(), counted.sum())
         )
+        self._counts = torch.maximum(self._counts, ended)
         self._returns *= 1 - ended
         self._lengths *= 1 - ended
         self._names = tuple(log)

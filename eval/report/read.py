@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
-from itertools import chain
+from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -159,9 +159,13 @@ def read_curves(folder: Path) -> Table:
             files.append(found)
     # By where each begins, as a resumed run begins later: the names hold a clock, which may have run back.
     files.sort(key=lambda found: found[0][1])
-    scalars = list(chain.from_iterable(files))
+    scalars = []
+    end = inf
+    for found in reversed(files):
+        # What was logged after the checkpoint from which a run was resumed is of a training that was given up.
+        scalars += [scalar for scalar in found if scalar[1] < end]
+        end = min(end, found[0][1])
     table: Table = pd.DataFrame(scalars, columns=["tag", "iteration", "value"])
-    # A resumed run repeats the iterations after its checkpoint; the later values count.
     return table.drop_duplicates(["tag", "iteration"], keep="last").pivot(
         index="iteration", columns="tag", values="value"
     )

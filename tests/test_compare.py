@@ -160,6 +160,12 @@ class ReadTest(Compared):
         found = read_curves(a)["task/grasped"]
         assert_allclose(found, [0.1] * 5 + [0.2] * 7, rtol=1e-6)
 
+    def test_iterations_that_a_resumed_run_has_not_repeated_yet_are_no_part_of_it(self):
+        a = self.write_curves("a", pd.DataFrame({"task/grasped": 0.1}, index=range(1, 11)))
+        self.write_curves("a", pd.DataFrame({"task/grasped": 0.2}, index=range(6, 9)))
+        found = read_curves(a)["task/grasped"]
+        assert_allclose(found, [0.1] * 5 + [0.2] * 3, rtol=1e-6)
+
     def test_event_files_that_are_not_whole(self):
         """Cut anywhere: the head is missed, what is left of a tail is read as it was."""
         curves = pd.DataFrame(
@@ -544,6 +550,20 @@ class FairnessTest(Compared):
                 self.assertEqual(is_compared, not words)
         self.write_results("usual", engines=("sapien",), episode_seconds=12.0)
         self.assertRegex(self.compare("usual"), r"\(5: usual in mujoco; 12: usual in sapien\)")
+
+    def test_results_of_a_policy_from_before_a_run_went_on(self):
+        policy = "f2ca1bb6c7e907d06dafe4687e579fce76b37e4e93b7605022da52e6ccc26fd2"  # of "test\n"
+        self.run_and_results("a", {"inputs": {"demos": "ab", "policy": policy}})
+        self.assertNotIn("another policy", self.compare("a"), "no file to compare with")
+        for content, is_same in (("test\n", True), ("trained on", False)):
+            (self.folder / "a" / "policy.onnx").write_text(content)
+            words = (
+                "results of a in mujoco are of another policy than its policy.onnx. .*xreset eval"
+            )
+            found = re.search(words, self.compare("a"))
+            self.assertEqual(found is None, is_same)
+        (self.folder / "a" / "choice.json").write_text("{}")  # of xreset 0.1 to 0.3
+        self.assertNotIn("another policy", self.compare("a"))
 
     def test_a_training_that_began_with_the_networks_of_another(self):
         file = "runs/joint/checkpoints/000900.pt"

@@ -12,8 +12,9 @@ from xreset.eval.metrics import GOAL_DISTANCE
 from xreset.eval.report.read import Training, by_engine, how_to_evaluate
 from xreset.eval.results import read_evaluation
 from xreset.eval.stats import Table
+from xreset.files.storage import file_hash
 from xreset.files.text import quantity, short_name
-from xreset.learning.run import TEACHER
+from xreset.learning.run import CHOICE, TEACHER
 from xreset.task.config import evaluation_task
 
 _CONDITIONS = ("objects", "object meshes", "number of episodes", "seed of the evaluation")
@@ -52,10 +53,30 @@ def remarks(trainings: Sequence[Training]) -> list[str]:
         if not training.results:
             found.append(f"{training.label} has no results. {how_to_evaluate(training.folder)}")
             continue
+        found += _outdated(training)
         found += _about_teacher(training)
         if len(trainings) == 1:
             found += expected(training)
     return found
+
+
+def _outdated(training: Training) -> list[str]:
+    """Return a sentence if results are of another policy than the run has, which may have gone on since."""
+    folder = training.folder
+    file = folder / "policy.onnx"
+    if training.run is None or not file.is_file() or (folder / CHOICE).is_file():
+        return []
+    present = file_hash(file)
+    engines = []
+    for engine, result in training.results.items():
+        if result.inputs.get("policy", present) != present:
+            engines.append(engine)
+    if not engines:
+        return []
+    return [
+        f"The results of {training.label} in {', '.join(engines)} are of another policy than its policy.onnx. If the "
+        f"training went on since, evaluate again: xreset eval {folder} --demos DEMOS"
+    ]
 
 
 def _about_teacher(training: Training) -> list[str]:

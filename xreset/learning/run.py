@@ -35,6 +35,8 @@ from xreset.task.contract import Contract
 SCHEMA = "xreset-run/1"
 TEACHER = "teacher.onnx"
 """File of the teacher's policy in the run folder of a distillation."""
+CHOICE = "choice.json"
+"""File in which earlier versions named the checkpoint to play."""
 T = TypeVar("T", "RunInfo", "RobotData")
 ENOUGH = 0.97
 """Share of the minutes from which a training counts as done, because a new start would take longer than the rest."""
@@ -169,7 +171,7 @@ def played_checkpoint(folder: Path) -> Path:
     """Return the newest checkpoint, or the one that ``xreset select`` of 0.1 to 0.3 chose, if the run still has it and
     has not gone on since; ``RunError`` if there is none."""
     newest = latest_checkpoint(folder)
-    path = folder / "choice.json"
+    path = folder / CHOICE
     if not path.is_file() or newest.name not in path.read_text():
         return newest
     chosen = read_json(path).get("chosen")

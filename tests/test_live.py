@@ -312,6 +312,25 @@ class FaultTest(TestCase):
         self.assertGreater(outcome.refused[0], 10)
         self.assertEqual((len(driver.sent), driver.stops), (149, 1))  # the first pose is faulty
 
+    def test_a_sensor_of_forces_that_begins_with_a_fault(self):
+        """The first forces are not finite, so there are no sound ones before them."""
+        forces = []
+
+        class Noting(Steady):
+            def step(self, reading):
+                forces.append(reading.tip_force)
+                return super().step(reading)
+
+        def fault(time, reading):
+            if time < 0.05:
+                return reading
+            return replace(reading, tip_force=np.full((2, 3), np.nan if time < 0.1 else 1.0))
+
+        self.assertIsNone(Runner(Noting(), Scripted(fault)).run(1).reason)
+        self.assertEqual(forces[:3], [None] * 3)
+        assert_array_equal(np.concatenate(forces[3:5]), np.zeros((2, 2, 3)))
+        assert_array_equal(forces[-1], np.ones((1, 2, 3)))
+
 
 class EngineTest(TestCase):
     def test_the_graph_observes_what_the_environment_observes(self):

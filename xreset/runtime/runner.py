@@ -342,7 +342,9 @@ def _finite(values: Array) -> Array:
 
 
 def _rows(chosen: Array, new: Any, old: Any) -> Any:
-    """Return the chosen rows [N] of new values, and the other rows of old ones."""
+    """Return the chosen rows [N] of new values, and the other rows of old ones; zeros where there are none."""
     if new is None or chosen.all():
         return new
+    if old is None:
+        old = np.zeros_like(new)
     return np.where(chosen.reshape(-1, *[1] * (new.ndim - 1)), new, old)

@@ -139,17 +139,20 @@ def verdict(results: Sequence[EvalResult]) -> tuple[str, list[str]]:
     """Return a sentence that says whether the policy may be tried on a robot, and the reasons against it; nothing if no
     fault that decides was tried at any value.
 
-    It may if every engine shows at least :data:`LEAST` without faults, and no loss beyond :data:`CRITERIA`.
+    It may if every engine shows at least :data:`LEAST` without faults, and no loss beyond :data:`CRITERIA`, over enough
+    demonstrations.
     """
     against = []
     unsure = []
     tried = 0
+    few = False
     for result in results:
         progress = result.mean("task_progress")
         if progress < LEAST:
             against.append(f"{result.engine}: only {100 * progress:.0f} % without any fault.")
         for curve, point, most in _deciding_points(result):
             tried += 1
+            few = few or not point.demonstrations_suffice
             if -point.difference <= most:
                 continue
             low, high = (-100 * bound for bound in reversed(point.difference_ci95))
@@ -170,6 +173,8 @@ def verdict(results: Sequence[EvalResult]) -> tuple[str, list[str]]:
         sentence = "Not shown to be ready: some losses may be too large. Play more demonstrations."
     elif tried < len(CRITERIA) * len(results):
         sentence = "No verdict: not every fault that decides was tried."
+    elif few:
+        sentence = "Not shown to be ready by fewer than six demonstrations. Play more (--demos)."
     return sentence, [*against, *unsure]
 
 

@@ -126,19 +126,20 @@ class FrameTest(TestCase):
 
 
 class VerdictTest(TestCase):
-    def result(self, engine="mujoco", progress=0.8, only=None, **losses):
+    def result(self, engine="mujoco", progress=0.8, only=None, demos=6, **losses):
         """The result of a sweep; ``action_delay_0=0.2`` is a loss of 20 points at the first value in every episode."""
         sweep = {}
         for prop in FAULTS[:only]:
             name = prop.option.replace("-", "_")
             for i, value in enumerate(prop.values):
                 loss = losses.get(f"{name}_{i}", 0.0)
-                sweep[prop.option, value] = [progress - loss] * 12
-        return swept([progress] * 12, sweep, engine)
+                sweep[prop.option, value] = [progress - loss] * (2 * demos)
+        return swept([progress] * (2 * demos), sweep, engine)
 
     def test_verdicts(self):
         ready = ("Ready for a first, careful trial on a robot.", [])
         self.assertEqual(verdict([self.result()]), ready)
+        self.assertIn("by fewer than six", verdict([self.result(demos=5)])[0])
         found = [self.result(), self.result("sapien", action_delay_2=0.2)]
         sentence, reasons = verdict(found)
         self.assertEqual(sentence, "Not ready for a robot.")

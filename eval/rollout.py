@@ -25,14 +25,14 @@ from xreset.eval.policy_spec import PolicySpec
 from xreset.eval.results import Rollouts, Trace
 from xreset.files.checks import frozen
 from xreset.files.progress import Progress, unseen
-from xreset.files.records import schema_of
+from xreset.files.records import schema_of, stated_inputs
 from xreset.physics import Backend, State
 from xreset.physics.plugins import backend_class, device_for, make_backend
 from xreset.policy.onnx_policy import Policy
 from xreset.resets.bank import ResetBank
 from xreset.resets.distribution import Reset, ResetDistribution
 from xreset.resets.goals import GoalSet
-from xreset.resets.inputs import Data, load_inputs
+from xreset.resets.inputs import Data, Inputs, load_inputs
 from xreset.resets.schedule import schedule
 from xreset.retarget.file import Retargeted
 from xreset.spec import ObjectSpec, RobotSpec, SceneSpec
@@ -183,7 +183,7 @@ def load_trial(
     )
     bank = inputs.bank
     hashes = {} if policy.hash is None else {"policy": policy.hash}
-    hashes["demos"] = inputs.hash or _hash_of(bank)
+    hashes["demos"] = _hash_of_demos(inputs)
     used = [o for o in inputs.objects if o.name in bank.sequence_object]
     if isinstance(inputs.data, GoalSet):
         task = replace(task, reset=replace(task.reset, spawn_xy=0.0, spawn_yaw=0.0))
@@ -200,8 +200,16 @@ def load_trial(
     )
 
 
-def _hash_of(bank: ResetBank) -> str:
-    """Return the SHA-256 of starts and goals that are in no file."""
+def _hash_of_demos(inputs: Inputs) -> str:
+    """Return the SHA-256 of the demonstrations' file, also for motion that was made of it; of starts and goals that are
+    in no file."""
+    if inputs.path and isinstance(inputs.data, Retargeted):
+        stated = stated_inputs(inputs.path).get("demos")
+        if stated:
+            return stated
+    if inputs.hash:
+        return inputs.hash
+    bank = inputs.bank
     digest = sha256()
     for name, column in schema_of(ResetBank).items():
         if column.shape[:1] == ("S",):

@@ -21,7 +21,7 @@ from tests import toy_grasp
 from tests.data import InFolder, refuses
 from tests.toy_bank import SOUP, SPAM, toy_bank
 from tests.toy_results import OBJECTS, toy_result, toy_rollouts
-from xreset import evaluate, load_object, load_policy
+from xreset import evaluate, load_object, load_policy, retarget_demos, synthesize, write_demos
 from xreset.errors import FileFormatError, PolicyError, XResetError
 from xreset.eval.engines.recording import play
 from xreset.eval.metrics import METRICS, EpisodeMetrics, MetricPoints
@@ -586,6 +586,18 @@ class ResultsTest(InFolder):
         hashes = [load_trial(policy, each).inputs["demos"] for each in (bank, bank, other)]
         self.assertEqual(hashes[0], hashes[1])
         self.assertNotEqual(hashes[0], hashes[2])
+
+    def test_motion_counts_as_the_demonstrations_that_it_was_made_of(self):
+        """ik plays motion, policies play demonstrations: reports compare them."""
+        demos = self.folder / "demos.npz"
+        write_demos(demos, synthesize([SOUP], 1, seed=2))
+        motion = self.folder / "motion.npz"
+        retarget_demos(demos, "openarm", out=motion)
+        policy = load_policy("zero", robot="openarm")
+        trials = [load_trial(policy, path) for path in (demos, motion)]
+        self.assertEqual(*[trial.inputs["demos"] for trial in trials])
+        for name in ("start_pos", "start_quat_wxyz", "goal_pos", "goal_quat_wxyz"):
+            assert_array_equal(*[getattr(trial.bank, name) for trial in trials])
 
     def test_the_shortest_episodes_have_traces(self):
         """Usually three control steps lie between two states; these episodes have one other state."""

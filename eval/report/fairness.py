@@ -27,7 +27,6 @@ _PLAYED_TASK = (
 """Fields of a training's task that make its evaluation easier or harder, because the evaluation keeps them
 (:func:`xreset.task.config.evaluation_task`). An evaluation may only change the length of episodes."""
 _LENGTH = "task.termination.episode_seconds"
-_SAME_NAMES = " Their sequences have the same names: if one was made from the other, as for ik, they are comparable."
 
 
 _IK = (
@@ -120,10 +119,7 @@ def uneven(trainings: Sequence[Training]) -> list[str]:
     for name in (*_CONDITIONS, *tasks, *of_one):
         found += _difference(table, name, name)
     if table["objects"].nunique() == 1:
-        same_names = table["sequences"].nunique() == 1
-        found += _difference(
-            table, "demonstrations", "demonstrations", _SAME_NAMES if same_names else ""
-        )
+        found += _difference(table, "demonstrations", "demonstrations")
     for engine, own in table.groupby("engine"):
         found += _difference(own, "version", f"version of {engine}")
     return found
@@ -147,9 +143,6 @@ def _condition_table(trainings: Sequence[Training]) -> Table:
                 # the absolute path, because a relative one may mean the same folder
                 "object meshes": str(Path(folder).resolve()) if folder else "stand-ins",
                 "demonstrations": result.inputs.get("demos", "")[:12],
-                "sequences": tuple(
-                    sorted(set(episodes["object"] + "/" + episodes["sequence_name"]))
-                ),
                 "number of episodes": len(result.nominal),
                 "seed of the evaluation": result.seed,
             }
@@ -171,7 +164,7 @@ def _played_task(training: Training) -> dict[str, str]:
     return kept
 
 
-def _difference(table: Table, column: str, what: str, advice: str = "") -> list[str]:
+def _difference(table: Table, column: str, what: str) -> list[str]:
     """Return a sentence that lists the evaluations with each value of a condition; none if all have the same value.
     A training with one value in all of its engines is named without the engines."""
     if table[column].nunique() < 2:
@@ -183,8 +176,7 @@ def _difference(table: Table, column: str, what: str, advice: str = "") -> list[
             everywhere = len(own) == (table["run"] == label).sum()
             names += [label] if everywhere else [f"{label} in {engine}" for engine in own["engine"]]
         parts.append(f"{value}: {', '.join(names)}")
-    verdict = "perhaps not comparable" if advice else "not comparable"
-    return [f"These results are {verdict}: not the same {what} ({'; '.join(parts)}).{advice}"]
+    return [f"These results are not comparable: not the same {what} ({'; '.join(parts)})."]
 
 
 def begun(trainings: Sequence[Training]) -> list[str]:

@@ -242,6 +242,7 @@ def train_todo(run: Run) -> Todo:
 def eval_todo(run: Run, folder: Path, spec: Evaluation, subset: Subset, engines: list[str]) -> Todo:
     """Return the engines in which an evaluation has no result, or a result of other episodes or files."""
     policy = run.spec.policy
+    files = {"demos": subset.demos}
     demos = subset.demos
     if policy == "ik":
         demos = subset.robot(run.spec.robot) / "retargeted.npz"
@@ -257,7 +258,6 @@ def eval_todo(run: Run, folder: Path, spec: Evaluation, subset: Subset, engines:
         out=folder,
         meshes=subset.meshes,
     )
-    files = {"demos": demos}
     if policy is None:
         files["policy"] = run.folder / "policy.onnx"
     trained = (run.config or TrainConfig()).task.termination.episode_seconds

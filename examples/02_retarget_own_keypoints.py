@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 
 import xreset
-from xreset.demos.keypoints import Convention, read_keypoints
 
 
 def record(file: Path) -> None:
@@ -26,16 +25,16 @@ def record(file: Path) -> None:
 def main(out: Path) -> None:
     """Write ``recorded.npz`` and ``bank.npz``."""
     record(out / "recorded.npz")
-    # what the numbers mean is stated, never guessed
-    convention = Convention(
+    demos = xreset.import_keypoints(
+        out / "recorded.npz",
+        # what the numbers mean is stated, never guessed
         order="mediapipe",
         units="mm",
-        frame="table",
+        coordinates="table",
         fps=30.0,
         object_name="005_tomato_soup_can",
         side="right",
     )
-    demos = read_keypoints(out / "recorded.npz", convention)
 
     robot = xreset.load_robot("openarm")
     can = xreset.load_object("soup")

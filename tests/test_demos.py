@@ -143,10 +143,10 @@ class Archive(InFolder):
         names = self.demos.sequence_name
         for options, indices in (
             ({"objects": ["banana"]}, [2, 3]),
-            ({"objects": "banana", "sides": "right"}, [2, 3]),
-            ({"max_per_object": 1}, [0, 2]),
+            ({"objects": "banana", "side": "right"}, [2, 3]),
+            ({"per_object": 1}, [0, 2]),
             ({"indices": [3, 0]}, [3, 0]),
-            ({"names": names[1:2], "sides": ["right"], "subjects": ["synthetic"]}, [1]),
+            ({"sequences": names[1:2], "side": "right", "subjects": ["synthetic"]}, [1]),
         ):
             self.assertEqual(
                 self.demos.select(**options).sequence_name.tolist(), names[indices].tolist()
@@ -154,19 +154,22 @@ class Archive(InFolder):
         picked = self.demos.select(indices=[3, 0])
         assert_array_equal(picked.goal_pose[0][1], self.demos.object_pos[self.demos.frames(0)][-1])
         for options, message in (
-            ({"sides": ["left"]}, "no hand side left. Choose from: 'right'"),
+            ({"side": "left"}, "no hand side left. Choose from: 'right'"),
             ({"indices": [4]}, "there are 4 sequences"),
             (
                 {"objects": ["soup", "cup", "mug"]},
                 "Unknown objects 'cup', 'mug'. Choose from: 005_tomato_soup_can",
             ),
             ({"share": 0.0}, "share is 0, expected"),
+            ({"per_object": 1, "pick": "last"}, "pick is 'last', expected first, spread or"),
             ({"indices": [True, False, False, True]}, r"whole numbers. Of a mask: np.flatnonzero"),
             ({"indices": [1.5]}, "expected whole numbers"),
         ):
             self.assertRaisesRegex(DemoError, message, self.demos.select, **options)
+        words = "Demos.select.. got an unexpected .* 'most'; it takes objects, sequences, subjects"
+        self.assertRaisesRegex(TypeError, words, self.demos.select, most=1)
         with self.assertRaisesRegex(XResetError, "^seed is -1, expected a whole number from 0"):
-            self.demos.select(max_per_object=1, seed=-1)
+            self.demos.select(per_object=1, pick="random", seed=-1)
 
     def test_split_by_share_spread_and_chance(self):
         parts = []
@@ -177,11 +180,11 @@ class Archive(InFolder):
         alone = demos.select(objects=["soup"])
         for options, soup in (
             ({"share": 0.25}, ["00", "01", "10"]),
-            ({"max_per_object": 3, "spread": True}, ["01", "21", "41"]),
+            ({"per_object": 3, "pick": "spread"}, ["01", "21", "41"]),
             # the choice for an object depends on the seed alone
             (
-                {"max_per_object": 3, "seed": 1},
-                alone.select(max_per_object=3, seed=1).sequence_name.tolist(),
+                {"per_object": 3, "pick": "random", "seed": 1},
+                alone.select(per_object=3, pick="random", seed=1).sequence_name.tolist(),
             ),
         ):
             with self.subTest(**options):
@@ -189,7 +192,8 @@ class Archive(InFolder):
                 self.assertEqual((len(kept), len(rest)), (6, 18))
                 self.assertFalse(set(kept.sequence_name) & set(rest.sequence_name))
                 self.assertEqual(kept.select(objects=["soup"]).sequence_name.tolist(), soup)
-        self.assertNotEqual(alone.select(max_per_object=3, seed=2).sequence_name.tolist(), soup)
+        other = alone.select(per_object=3, pick="random", seed=2)
+        self.assertNotEqual(other.sequence_name.tolist(), soup)
         self.assertRaisesRegex(DemoError, "none is left", demos.split, share=1.0)
 
     def test_merge_demos(self):
@@ -392,7 +396,7 @@ class RealData(TestCase):
             archive = read_demos(data_dir() / name)
             for sequence in np.intersect1d(layout.sequence_name, archive.sequence_name):
                 compared += 1
-                a, b = (demos.select(names=[sequence]) for demos in (archive, layout))
+                a, b = (demos.select(sequences=[sequence]) for demos in (archive, layout))
                 for field in ("hand_side", "hand_valid"):
                     assert_array_equal(getattr(a, field), getattr(b, field))
                 assert_same_motion(a, b, angle=1e-4)
@@ -429,7 +433,7 @@ class Synthetic(InFolder):
         with patch.multiple(synth, _FEW=1, _BATCH=1):  # in other processes
             again = synthesize(["banana", "soup"], per_object=1, seed=0)  # fewer objects
         for name in ("banana", "soup"):
-            a = self.demos.select(objects=[name], sides=["right"])
+            a = self.demos.select(objects=[name], side="right")
             b = again.select(objects=[name])
             for array in ("hand_keypoints", "wrist_quat_wxyz", "object_pos", "object_quat_wxyz"):
                 self.assertEqual(getattr(a, array).tobytes(), getattr(b, array).tobytes())

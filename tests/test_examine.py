@@ -144,7 +144,7 @@ class Wrong(InFolder):
             ("right_9x20", "20200820-subject-03/20200820_140454"),
             ("right_11x20", "20200908-subject-05/20200908_145254"),
         ):
-            demos = read_demos(data_dir() / f"dexycb_{archive}.npz").select(names=[name])
+            demos = read_demos(data_dir() / f"dexycb_{archive}.npz").select(sequences=[name])
             known = surfaces_of(demos, meshes)
             up = np.float32([0.0, 0.0, 0.02])
             raised = replace(demos, object_pos=demos.object_pos + up)
@@ -163,7 +163,7 @@ class Wrong(InFolder):
             ("right_9x20", "20200908-subject-05/20200908_144342", 1, "(w, x, y, z)"),
             ("right_11x20", "20201022-subject-10/20201022_112255", 1, "(w, x, y, z)"),
         ):
-            demos = read_demos(data_dir() / f"dexycb_{archive}.npz").select(names=[name])
+            demos = read_demos(data_dir() / f"dexycb_{archive}.npz").select(sequences=[name])
             quats = np.roll(demos.object_quat_wxyz, shift, axis=1)
             with self.subTest(name):
                 known = surfaces_of(demos, meshes)

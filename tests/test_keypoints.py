@@ -216,7 +216,7 @@ class Synthetic(InFolder):
         path.write_text(first + re.sub("(?m)^a,", "b,", first.split("\n", 1)[1]))
         found = read_keypoints(path, PLAIN)
         self.assertEqual(found.sequence_name.tolist(), ["a", "b"])
-        self.same(found.select(names=["a"]))
+        self.same(found.select(sequences=["a"]))
         for words, text in (
             (
                 "could not convert string to float: 'oops'",

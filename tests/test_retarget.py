@@ -509,7 +509,7 @@ class PipelineTest(InOneFolder):
 class RealDataTest(TestCase):
     def test_fingertips_follow_a_real_hand(self):
         demos = read_demos(data_dir() / "dexycb_right_9x20.npz")
-        demos = demos.select(objects=["soup"], max_per_object=1)
+        demos = demos.select(objects=["soup"], per_object=1)
         objects = [*demo_objects(demos).values()]
         result = retarget_demos(demos, robots.load("ur7e-sharpa"), objects)
         self.assertLess(result.hand_error[result.annotated].mean(), 0.010)

@@ -6,6 +6,7 @@ from xreset.demos.archive import Demos as Demos
 from xreset.demos.archive import merge_demos as merge_demos
 from xreset.demos.archive import read_demos as read_demos
 from xreset.demos.archive import write_demos as write_demos
+from xreset.demos.verbs import import_keypoints as import_keypoints
 from xreset.demos.verbs import synthesize as synthesize
 from xreset.env.manipulation import ManipulationEnv as ManipulationEnv
 from xreset.env.manipulation import make_env as make_env

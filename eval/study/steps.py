@@ -123,7 +123,7 @@ class Subset:
             demos = read_demos(self.given / data.demos)
         else:
             demos = synthesize(objects, data.synthetic_per_object)
-        chosen = demos.select(objects=objects, max_per_object=self.per_object)
+        chosen = demos.select(objects=objects, per_object=self.per_object)
         write_demos(self.demos, chosen, config=self.definition)
 
 

@@ -70,7 +70,7 @@ def _summarize(demos: Demos, what: object, meshes: Path | None = None) -> None:
 
 COMMAND = {
     "import dexycb": verb(verbs.import_dexycb, _show),
-    "import keypoints": verb(verbs.import_keypoints, _show_recorded),
+    "import keypoints": verb(verbs.import_keypoints, _show_recorded, out=REQUIRED),
     "synth": verb(verbs.synthesize, _show, names=(), out=REQUIRED),
     "select": verb(verbs.select_demos, _show_selected),
 }

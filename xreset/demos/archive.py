@@ -10,7 +10,7 @@ import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -146,34 +146,42 @@ class Demos(ObjectMotions):
     def select(
         self,
         *,
-        indices: Iterable[int] | None = None,
-        names: Iterable[str] | None = None,
         objects: Iterable[str] | None = None,
-        sides: Iterable[str] | None = None,
+        sequences: Iterable[str] | None = None,
         subjects: Iterable[str] | None = None,
-        max_per_object: int | None = None,
+        side: Literal["right", "left", "both"] = "both",
+        per_object: int | None = None,
         share: float = 1.0,
-        spread: bool = False,
-        seed: Seed | None = None,
+        pick: Literal["first", "spread", "random"] = "first",
+        seed: Seed = 0,
+        indices: Iterable[int] | None = None,
     ) -> Demos:
         """Return the sequences that meet every given condition. A single name need not be in a list.
 
         Args:
-            indices: sequence indices; the result has their order.
-            names: names of sequences.
             objects: object names, official or the paper's.
-            sides: ``right``, ``left``.
+            sequences: names of sequences.
             subjects: names of the demonstrating persons.
-            max_per_object: keep the first n sequences of each object.
+            side: hand.
+            per_object: keep at most this many sequences of each object.
             share: keep this share of each object's sequences, at least one.
-            spread: keep sequences of each object from all over the archive instead of the first, which in most archives
-                are one person's.
-            seed: keep sequences of each object at random. The choice for an object does not depend on other objects.
+            pick: which ones of an object these are: the ``first``, which in most archives are one person's, some from
+                all over the archive (``spread``), or ``random`` ones, whose choice does not depend on other objects.
+            seed: of random ones.
+            indices: sequence indices; the result has their order.
 
         Raises:
-            DemoError: unknown index, name, object, side or subject (the message names all of them), a share that is
-                none, or nothing is left.
+            DemoError: unknown index, name, object or subject (the message names all of them), no such hand, a share
+                that is none, ``pick`` or ``seed`` without effect, or nothing is left.
         """
+        if pick not in ("first", "spread", "random"):
+            raise DemoError(f"pick is {shown(pick)}, expected first, spread or random.")
+        if pick != "first" and per_object is None and share == 1:
+            raise DemoError(
+                f"--pick {pick} needs a number of sequences. Add --per-object or --share."
+            )
+        if seed and pick != "random":
+            raise DemoError(f"--seed {seed} is for random picks. Add --pick random, or omit it.")
         chosen = np.arange(len(self))
         if indices is not None:
             chosen = np.asarray(list(indices))
@@ -192,9 +200,9 @@ class Demos(ObjectMotions):
             except ObjectError as error:
                 raise DemoError(f"The demonstrations lack an object: {error}") from None
         wanted = {
-            "sequence_name": names,
+            "sequence_name": sequences,
             "object_name": objects,
-            "hand_side": sides,
+            "hand_side": None if side == "both" else side,
             "subject": subjects,
         }
         for field, values in wanted.items():
@@ -202,8 +210,8 @@ class Demos(ObjectMotions):
                 chosen = chosen[np.isin(getattr(self, field)[chosen], self._known(field, values))]
         if not 0 < share <= 1:
             raise DemoError(f"The share is {share:g}, expected a number above 0 and at most 1.")
-        if max_per_object is not None or share < 1:
-            chosen = self._few_per_object(chosen, max_per_object, share, spread, seed)
+        if per_object is not None or share < 1:
+            chosen = self._few_per_object(chosen, per_object, share, pick, seed)
         if not len(chosen):
             raise DemoError("No sequence meets all conditions of the selection. Relax one of them.")
         frames = [np.r_[self.frames(i)] for i in chosen.tolist()]
@@ -239,7 +247,7 @@ class Demos(ObjectMotions):
         return wanted
 
     def _few_per_object(
-        self, chosen: np.ndarray, most: int | None, share: float, spread: bool, seed: int | None
+        self, chosen: np.ndarray, most: int | None, share: float, pick: str, seed: int
     ) -> np.ndarray:
         """Return some of the chosen sequences of each object; arguments as of :meth:`select`."""
         names = self.object_name[chosen]
@@ -250,10 +258,10 @@ class Demos(ObjectMotions):
             count = max(1, round(share * len(rows)))
             if most is not None:
                 count = min(count, max(most, 0))
-            if seed is not None:
+            if pick == "random":
                 random = np.random.default_rng([seed, zlib.crc32(name.encode())])
                 rows = random.permutation(rows)
-            elif spread:
+            elif pick == "spread":
                 # one from each of n even parts, at another place in the parts for every object
                 place = (number + 0.5) / len(objects)
                 rows = rows[((np.arange(count) + place) * len(rows) / count).astype(int)]

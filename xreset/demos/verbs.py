@@ -60,7 +60,7 @@ def import_dexycb(folder: str | Path, out: OutputFile, *, progress: Progress = u
 @obeys_rules
 def import_keypoints(
     path: str | Path,
-    out: OutputFile,
+    out: OutputFile | None = None,
     *,
     order: Literal["mano", "mediapipe", "openpose"],
     units: Literal["m", "mm"],
@@ -72,7 +72,7 @@ def import_keypoints(
     meshes: str | Path | None = None,
     trust: Annotated[bool, Option("trust_recordings")] = False,
 ) -> Demos:
-    """Read 21 hand keypoints and object poses of any tracker and write an archive of demonstrations.
+    """Read 21 hand keypoints and object poses of any tracker as demonstrations.
 
     Nothing is guessed: options must state what the files do not, and options that contradict the numbers are refused.
     The page docs/demonstrations.md has the layout of the files.
@@ -115,7 +115,8 @@ def import_keypoints(
         "table_from_camera": None if T is None else T.tolist(),
     }
     inputs = {"keypoints": file_hash(path)} if Path(path).is_file() else {}
-    write_demos(out, demos, config=config, inputs=inputs)
+    if out is not None:
+        write_demos(out, demos, config=config, inputs=inputs)
     return demos
 
 
@@ -194,24 +195,7 @@ class Selection(Options):
 
     def conditions(self) -> dict[str, Any]:
         """Return the arguments of ``Demos.select``."""
-        if self.pick != "first" and self.per_object is None and self.share == 1:
-            raise DemoError(
-                f"--pick {self.pick} needs a number of sequences. Add --per-object or --share."
-            )
-        if self.seed and self.pick != "random":
-            raise DemoError(
-                f"--seed {self.seed} is for random picks. Add --pick random, or omit it."
-            )
-        return {
-            "objects": self.objects or None,
-            "names": self.sequences or None,
-            "subjects": self.subjects or None,
-            "sides": None if self.side == "both" else [self.side],
-            "max_per_object": self.per_object,
-            "share": self.share,
-            "spread": self.pick == "spread",
-            "seed": self.seed if self.pick == "random" else None,
-        }
+        return {name: value for name, value in asdict(self).items() if value != ()}
 
 
 @obeys_rules
@@ -261,7 +245,7 @@ def select_demos(
             _name_missing(kept, others, str(rest), say)
             _name_missing(others, kept, str(out or "the selection"), say)
     if mirror:
-        kept = _mirrored(kept.select(sides=["left"]), meshes, say)
+        kept = _mirrored(kept.select(side="left"), meshes, say)
     if rest is not None and others is not None:
         write_demos(rest, others, config={"select_others": asdict(selection)}, inputs=inputs)
     if out is not None:

@@ -268,7 +268,12 @@ def obeys_rules(function: Callable[P, T]) -> Callable[P, T]:
 
     @wraps(function)
     def call(*positional: P.args, **named: P.kwargs) -> T:
-        given = signature(function).bind(*positional, **named).arguments
+        declared = signature(function)
+        try:
+            given = declared.bind(*positional, **named).arguments
+        except TypeError as error:
+            names = ", ".join(name for name in declared.parameters if name != "self")
+            raise TypeError(f"{function.__qualname__}() {error}; it takes {names}") from None
         for name, value in given.items():
             check_value(name, value, marks_in(_hint_of(function, name)))
         return function(*positional, **named)

@@ -143,7 +143,7 @@ def place_robot(
 
     spec = load_robot(robot)
     every = read_demos(demos)
-    chosen = every.select(max_per_object=_PER_OBJECT, spread=True)
+    chosen = every.select(per_object=_PER_OBJECT, pick="spread")
     objects = list(demo_objects(chosen, meshes).values())
     paths = wrist_paths(chosen, spec, objects, progress=partial(progress, "hand retargeting"))
     grounded = rest_on_table(every, objects)

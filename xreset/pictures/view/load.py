@@ -185,7 +185,7 @@ def _human_of(path: str | Path, demos_path: str | Path, view: View) -> dict[str,
             f"{demos_path} lacks {quantity(len(missing), 'sequence')} of {path}, such as {missing[0]!r}."
             " Give the demonstrations that the file was made from."
         )
-    demos = demos.select(names=used)
+    demos = demos.select(sequences=used)
     found = demos.sequence_name.tolist()
     index = np.array([found.index(view.sequence_name[number]) for number in view.sequence])
     if (view.frame >= np.diff(demos.frame_offsets)[index]).any():

@@ -271,12 +271,12 @@ class RewardTest(TestCase):
 
     def test_what_is_not_a_term_is_refused(self):
         for name, term, error, problem in (
-            ("no_such_module:f", {}, RunError, "No module named"),
-            (f"{__name__}:no_such_function", {}, RunError, "no attribute"),
-            (f"{__name__}:IDENTITY", {}, RunError, "expected a function"),
+            ("no_such_module:f", {}, RunError, "No module named.*Add its folder to PYTHONPATH"),
+            (f"{__name__}:no_such_function", {}, RunError, "test_task.py has no function 'no_such_function'"),
+            (f"{__name__}:IDENTITY", {}, RunError, "test_task.py has no function 'IDENTITY'"),
             (f"{__name__}:one_number", {}, RunError, r"gave \(\). Return a tensor of shape \(1,\)"),
             (f"{__name__}:height", {"most": 1.0}, ValueError, r"height does not fit height .unknown: most; known: "),
-            ("raech", {"width": 1.0}, ValueError, "Unknown reward term 'raech'. Choose from: reach, best_reach"),
+            ("raech", {"width": 1.0}, ValueError, "Unknown reward term 'raech'. One of your own is named module:function. Choose from: reach, best_reach"),
             ("reach", {"width": -1.0}, ValueError, r"terms\.reach\.width is -1.0, expected a number above 0"),
             ("reach", {"width": 1.0, "with": 1.0}, ValueError, "unknown: with .width\\?.; known: width"),
             ("reach", {}, ValueError, r"terms\.reach does not fit reach .missing: width"),
@@ -1313,6 +1313,11 @@ class ObservationTest(TestCase):
     def test_what_is_not_an_observation_is_refused(self):
         for name, parameters, words in (
             ("smell", {}, "Unknown observation 'smell'. Choose from: object_pos"),
+            (
+                "my:smell",
+                {},
+                "Unknown observation 'my:smell'. Only reward terms may be functions of your own",
+            ),
             (
                 "joint_vel",
                 {"noise": 0.1},

@@ -86,22 +86,31 @@ class Functions(dict[str, Callable[..., Any]]):
         if self._own and ":" in term:
             return _imported(self._kind, term)
         if function not in self:
+            own = ""
+            if self._own:
+                own = "One of your own is named module:function. "
+            elif ":" in function:
+                own = "Only reward terms may be functions of your own. "
             raise WrongValueError(
-                f"Unknown {self._kind} {function!r}. Choose from: {', '.join(self)}."
+                f"Unknown {self._kind} {function!r}. {own}Choose from: {', '.join(self)}."
             )
         return self[function]
 
 
 def _imported(kind: str, name: str) -> Callable[..., Any]:
     """Return the function ``module:function`` of the user."""
-    module, _, function = name.partition(":")
+    place, _, function = name.partition(":")
     try:
-        found = getattr(import_module(module), function)
+        module = import_module(place)
     except Exception as error:  # a user's module may fail in any way
         reason = f"{type(error).__name__}: {error}"
-        raise RunError(
-            f"the {kind} {name!r} cannot be loaded ({reason}). Is its folder in PYTHONPATH?"
-        ) from error
+        is_missing = isinstance(error, ModuleNotFoundError) and place.startswith(str(error.name))
+        fix = "Add its folder to PYTHONPATH." if is_missing else f"The error is in {place}."
+        raise RunError(f"The {kind} {name!r} cannot be loaded ({reason}). {fix}") from error
+    found = getattr(module, function, None)
     if not callable(found):
-        raise RunError(f"the {kind} {name!r} is {found!r}, expected a function.")
+        file = getattr(module, "__file__", place)
+        raise RunError(
+            f"The {kind} {name!r}: {file} has no function {function!r}. Correct the name."
+        )
     return found

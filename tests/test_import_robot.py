@@ -452,7 +452,7 @@ class Toy(Robots):
         said = " ".join(made.guessed)
         self.assertIn("left out: joints that only let the hand float: b0, b1, b2", said)
         self.assertEqual(said.count("b0"), 1, "it gets neither limits nor a speed")
-        self.assertIn("never collide, because the MJCF says so: f1_a and f2_a", said)
+        self.assertIn("never collide, because the MJCF says so: f1_a with f2_a", said)
         self.assertIn("left out: what moves next to the hand: pen", said)
         spec = load_robot(made.folder)
         self.assertEqual(len(spec.joint_names), 10)

@@ -342,7 +342,7 @@ class Hand:
         if len(chains) == 2:
             why = "it can oppose the others" if scores[0] else "the two are alike"
             self._notes.append(
-                f"the thumb is the finger of {links[0]}: {why} (--thumb says another)"
+                f"the thumb is the finger of {links[0]}: {why} (--thumb chooses another)"
             )
             return chains[0]
         if not scores.any():
@@ -360,7 +360,7 @@ class Hand:
                 f". The vote is narrow: {chains[second].links[-1]} has {points[second]:.2f} points, "
                 f"{chains[first].links[-1]} {points[first]:.2f}. The picture shows which is right"
             )
-        self._notes.append(f"{note} (--thumb says another)")
+        self._notes.append(f"{note} (--thumb chooses another)")
         return chains[first]
 
     def _chains(self) -> list[Finger]:

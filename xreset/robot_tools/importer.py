@@ -153,7 +153,7 @@ def make_robot(
             ("they meet at home", at_home),
         ):
             if pairs:
-                names = "; ".join(f"{a} and {b}" for a, b in pairs)
+                names = listed([f"{a} with {b}" for a, b in pairs])
                 notes.append(f"never collide, because {why}: {names}")
         spec = replace(spec, collision_exclude=(*spec.collision_exclude, *at_home))
         spec = _with_free_spread(spec, notes)
@@ -197,7 +197,7 @@ def _read_arm(path: Path, flange: str | None, notes: list[str]) -> _Arm:
     tree = completed(read_source(path, notes), path, notes)
     if flange is None:
         flange = last_link(tree, None if robot is None else robot.hand_root)
-        notes.append(f"the hand is carried by the arm's link {flange!r} (--flange says another)")
+        notes.append(f"the hand is carried by the arm's link {flange!r} (--flange chooses another)")
     arm = bare(tree, tree.link(flange).name, notes)
     ahead = _out_of_flange(arm, flange)
     if robot is not None and robot.palm in tree.below(flange):

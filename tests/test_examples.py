@@ -52,7 +52,7 @@ class FaceTest(TestCase):
             "Seed",
         }
         # of functions that are commands, too
-        elsewhere |= {"Annotated", "Device", "Option", "Output", "Port", "Pose", "Png"}
+        elsewhere |= {"Annotated", "Device", "Option", "Output", "Port", "Pose", "Png", "Rate"}
         elsewhere |= {"Progress", "NamedProgress", "OutputFile", "Onnx", "Mp4"}
         functions = 0
         for name in xreset.__all__:

@@ -97,22 +97,10 @@ def read_keypoints(
     trust: bool = False,
 ) -> Demos:
     """Read a tracker's sequences: an npz (one sequence), a CSV (one, or several with a column ``sequence``), or a
-    folder of them.
+    folder of them; see :func:`~xreset.demos.verbs.import_keypoints`.
 
-    Args:
-        path: the file or folder.
-        convention: what the numbers mean.
-        meshes: folder of the objects' meshes, which the sequences are examined with; None: without meshes.
-        trust: whether sequences are taken that are certainly wrong (:mod:`xreset.demos.examine`).
-
-    Returns:
-        The demonstrations in metres and in the table frame. The wrist's orientation is that of five keypoints (wrist
-        and knuckles) fitted to an average hand: 3.6 degrees from MANO's at most, on DexYCB.
-
-    Raises:
-        DemoError: something about the numbers is unknown or contradicts itself; the message names the option that
-            states it.
-        FileFormatError: an npz file is damaged or does not have the arrays.
+    The wrist's orientation is that of five keypoints (wrist and knuckles) fitted to an average hand: 3.6 degrees from
+    MANO's at most, on DexYCB.
     """
     path = Path(path)
     if (convention.frame == "camera") != (convention.table_from_camera is not None):

@@ -90,6 +90,9 @@ def import_keypoints(
         meshes: folder of the objects' meshes, to examine the recordings with.
         trust: take recordings that are certainly wrong all the same.
 
+    Returns:
+        The demonstrations in metres and in the table frame.
+
     Raises:
         DemoError: something about the numbers is unknown or contradicts itself; the message names the option that
             states it.

@@ -23,6 +23,7 @@ from torch import Tensor
 from xreset.errors import RobotError
 from xreset.files.checks import frozen
 from xreset.files.progress import Progress
+from xreset.files.text import Brief
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import (
     matrix_to_quat,
@@ -104,7 +105,7 @@ class Reached:
 
 
 @frozen
-class Judgement:
+class Judgement(Brief):
     """Result of :func:`xreset.robot_tools.verbs.judge`."""
 
     robot: str

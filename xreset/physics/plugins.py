@@ -111,7 +111,7 @@ def robot_folder(name_or_folder: str | Path) -> Path:
         known = known_plugins(ROBOTS)
         raise RobotError(
             f"Unknown robot {shown(name)}, and no folder has that name. Choose from: {known}; or give the robot's "
-            "folder."
+            "folder, with --robot if a file names the robot."
         )
     module = load_plugin(ROBOTS, name)
     if not isinstance(module, ModuleType) or not module.__file__:

@@ -198,21 +198,21 @@ class CollectTest(Reported):
         self.write_soup()
         self.assertIsNone(self.read()[0].vision, "the run's configuration has no camera")
 
-    def write_teacher(self, engine="mujoco"):
-        traces = toy_rollouts().traces
-        write_result(self.folder / "teacher", toy_result(engine), traces, ("a", "b", "c"))
+    def write_teacher(self, engine="mujoco", **changes):
+        result = toy_result(engine, **changes)
+        write_result(self.folder / "teacher", result, toy_rollouts().traces, ("a", "b", "c"))
 
     def test_a_teacher_that_played_other_episodes_is_not_compared(self):
         self.write(("mujoco",))
         self.write_run("", teacher="many-objects")
-        for engine in (None, "sapien", "mujoco"):
+        for engine, demos in ((None, ""), ("sapien", "ab"), ("mujoco", "cd"), ("mujoco", "ab")):
             if engine is not None:
-                self.write_teacher(engine)
+                self.write_teacher(engine, inputs={"demos": demos})
             [note] = self.collect().notes
-            with self.subTest(engine):
+            with self.subTest(engine=engine, demos=demos):
                 self.assertEqual(
                     note.startswith("The teacher was not evaluated from the same starts. Make"),
-                    engine != "mujoco",
+                    (engine, demos) != ("mujoco", "ab"),
                 )
 
     def test_nothing_to_report(self):
@@ -260,6 +260,12 @@ class CollectTest(Reported):
         ):
             self.assertIn(words, text)
         self.assertEqual(html.count("<svg"), 2)
+        words = "did not play the same episodes, so what they show is not comparable"
+        self.assertNotIn(words, text)
+        for changes in ({"seed": 4}, {"inputs": policy | {"demos": "cd"}}):
+            other = swept([0.8] * 12, lost, "sapien", **({"inputs": policy} | changes))
+            write_result(self.folder / "faults", other, (), ())
+            self.assertIn(words, " ".join(self.collect().notes))
         self.write(inputs={"policy": "retrained"})
         (training,) = self.read()
         self.assertEqual(training.sweeps, ())

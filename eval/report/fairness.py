@@ -10,7 +10,7 @@ import pandas as pd
 
 from xreset.eval.metrics import GOAL_DISTANCE
 from xreset.eval.report.read import Training, by_engine, how_to_evaluate
-from xreset.eval.results import read_evaluation
+from xreset.eval.results import Evaluation, read_evaluation
 from xreset.eval.stats import Table
 from xreset.files.storage import file_hash
 from xreset.files.text import quantity, short_name
@@ -81,7 +81,11 @@ def _outdated(training: Training) -> list[str]:
 def _about_teacher(training: Training) -> list[str]:
     """Return what a student misses of its teacher's episodes, or how to make the teacher's results."""
     folder = training.folder
-    taught = read_evaluation(folder / "teacher")
+    taught = Evaluation()
+    for result in read_evaluation(folder / "teacher"):
+        own = training.results.get(result.engine)
+        if own is not None and own.inputs.get("demos") == result.inputs.get("demos"):
+            taught.append(result)
     if taught and (missed := missed_by_student(training.episodes, taught.to_frame())):
         return [missed]
     if training.run is None or training.run.teacher is None:

@@ -329,6 +329,12 @@ def _sweep(folder: Path, policies: set[str | None], notes: list[str]) -> Evaluat
         result = read_result(file)
         if len(result.changed) and result.inputs.get("policy") in policies:
             found.append(result)
+    played = {(each.inputs.get("demos"), each.seed, len(each.nominal)) for each in found}
+    if len(played) > 1:
+        notes.append(
+            f"The engines of {folder} did not play the same episodes, so what they show is not comparable. Give all of "
+            "them to one xreset stress."
+        )
     return found
 
 

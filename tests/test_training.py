@@ -54,7 +54,8 @@ from xreset.learning.run import (
     read_run,
 )
 from xreset.learning.runner import TrainingRunner, _stop_on_interrupt
-from xreset.learning.train import cleanly, refuse_another_training
+from xreset.learning.train import cleanly, default_device, refuse_another_training
+from xreset.physics.plugins import existing_device
 from xreset.policy.onnx_policy import check_contract
 from xreset.task.config import RewardConfig
 
@@ -276,6 +277,17 @@ class TrainingTest(WithBank):
             self.assertEqual(newest(out).iteration, 3)
             self.assertIn("is trained", self.resume(out))
             self.assertIn("iteration 4/4, 0.1/1 min", self.resume(out, iterations=4, minutes=1.0))
+
+    def test_the_default_gpu_is_the_one_that_cuda_means(self):
+        """A run that began without a device goes on with ``--device cuda``."""
+        self.assertEqual(default_device("mujoco-warp"), "cpu")
+        with (
+            patch("torch.cuda.is_available", return_value=True),
+            patch("torch.cuda.device_count", return_value=2),
+            patch("torch.cuda.current_device", return_value=0),
+        ):
+            self.assertEqual(default_device("mujoco-warp"), existing_device("cuda"))
+            self.assertEqual(default_device("pybullet"), "cpu")
 
     def test_the_same_call_goes_on_and_another_one_is_refused(self):
         out = self.folder / "job-again"

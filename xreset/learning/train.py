@@ -43,7 +43,7 @@ from xreset.learning.run import (
     write_run,
 )
 from xreset.learning.runner import CRITIC_ITERATIONS, TrainingRunner
-from xreset.physics.plugins import device_for
+from xreset.physics.plugins import device_for, existing_device
 from xreset.policy.onnx_policy import OnnxPolicy, check_contract
 from xreset.resets.bank import ResetBank, read_bank, write_bank
 from xreset.resets.goals import GoalSet, read_goals, with_goals, write_goals
@@ -53,8 +53,8 @@ from xreset.task.rewards import RewardFunction
 
 
 def default_device(engine: str) -> str:
-    """Return cuda if there is a GPU that the engine can use, else cpu."""
-    return device_for(engine, "cuda" if torch.cuda.is_available() else "cpu")
+    """Return the GPU that ``cuda`` means if the engine can use it, else cpu."""
+    return existing_device(device_for(engine, "cuda" if torch.cuda.is_available() else "cpu"))
 
 
 def write_data(folder: Path, data: ResetBank | GoalSet) -> Path:

@@ -83,6 +83,13 @@ class VectorEnvTest(WithEnv):
         for _ in range(inner.max_episode_length - 3):
             *_, truncated, _ = env.step(still)
         self.assertEqual(truncated.tolist(), [False, True, True])
+        env.step(still)
+        inner.backend.overflow[1] = True
+        _, reward, terminated, _, infos = env.step(still + 0.1)
+        self.assertEqual(
+            (terminated.tolist(), infos["faulty"].tolist()), ([False, True, False],) * 2
+        )
+        self.assertEqual([bool(value) for value in reward], [True, False, True])
         env.close()
 
     def test_actions_of_another_shape_or_kind_are_refused(self):

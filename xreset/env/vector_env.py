@@ -98,8 +98,8 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         # A world that begins a new episode ignores its action.
         action = torch.where(self._ended[:, None], 0.0, action)
         observations, reward, done, extras = self.env.step(action, begin=self._ended)
-        reward = torch.where(self._ended, 0.0, reward)
         faulty = extras["faulty"]
+        reward = torch.where(self._ended | faulty, 0.0, reward)
         self.log = extras["log"]
         self._observations = with_sound_rows(observations, self._observations)
         self._ended = done.bool()

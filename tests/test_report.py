@@ -430,6 +430,10 @@ class FailureTest(Reported):
             table_of(at_goal, near, near, lifted, replace(at_goal, reorient=False), broken)
         )
         self.assertEqual(list(counts.values()), [1, 2, 1, 1])
+        pushed = replace(at_goal, grasp=False)
+        self.assertEqual(sum(count_failures(table_of(pushed)).values()), 0)
+        counts = count_failures(table_of(replace(pushed, reorient=False)))
+        self.assertEqual(list(counts.values()), [0, 0, 0, 1], "an episode fails once")
 
 
 class PlotTest(Reported):

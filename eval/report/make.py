@@ -271,11 +271,13 @@ def _base64(content: bytes) -> str:
 
 
 def count_failures(episodes: Table) -> dict[str, int]:
-    """Return the number of episodes that failed in each stage, keyed by the failure in words."""
+    """Return the number of episodes that failed in each stage, keyed by the failure in words. An object that is pushed
+    to its goal needs no grasp."""
+    never = ~episodes["reorient_once"]
     missed = {
-        "never near the object": ~episodes["approach"],
-        "near it, but no grasp": episodes["approach"] & ~episodes["grasp"],
-        "grasped, never at the goal": episodes["grasp"] & ~episodes["reorient_once"],
+        "never near the object": never & ~episodes["approach"],
+        "near it, but no grasp": never & episodes["approach"] & ~episodes["grasp"],
+        "grasped, never at the goal": never & episodes["grasp"],
         "at the goal, but not in the end": episodes["reorient_once"] & ~episodes["reorient"],
     }
     return {what: int(rows.sum()) for what, rows in missed.items()}

@@ -26,6 +26,7 @@ from xreset.cameras.config import FRONT, VisionConfig
 from xreset.errors import FileFormatError, RunError
 from xreset.eval.report.clips import (
     Clip,
+    at_one_rate,
     best_everywhere,
     camera_for,
     draw_clips,
@@ -385,6 +386,20 @@ class ClipTest(Reported):
         self.assertEqual(round(fps), 10)
         self.assertEqual(frames.shape[1] % 4, 0)
         self.assertEqual(frames.shape[1] // 4 - 24, 150 + 200, "without its label")
+
+    def test_episodes_of_two_control_rates_keep_their_speed_in_one_film(self):
+        """All last 0.4 s, but one."""
+        clips = []
+        for count, fps in ((4, 7.5), (5, 10.0), (2, 10.0)):
+            frames = np.zeros((count, 2, 2, 3), np.uint8)
+            clips.append(
+                Clip(
+                    episode=None, frames=frames, times=np.arange(count) / fps, fps=fps, finite=True
+                )
+            )
+        shown, fps = at_one_rate(clips)
+        expected = [[0, 1, 2, 2, 3], [0, 1, 2, 3, 4], [0, 1, 1, 1, 1]]
+        self.assertEqual(([each.tolist() for each in shown], fps), (expected, 10.0))
 
     def test_runs_of_two_robots_are_drawn_each_with_its_own(self):
         folders = []

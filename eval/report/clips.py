@@ -298,17 +298,27 @@ def make_film(
             f"no demonstration in {trainings[0].results_folder} was recorded in every engine. "
             "Evaluate all engines in one command."
         )
-    every = list(chain(*columns.values()))
-    length = max(len(clip.frames) for clip in every)
+    shown, fps = at_one_rate(list(chain(*columns.values())))
     films = []
     for name, clips in columns.items():
         column = []
         for clip in clips:
-            shown = np.minimum(np.arange(length), len(clip.frames) - 1)  # ends with a still
-            half = clip.frames[shown, ::2, ::2]
+            half = clip.frames[shown.pop(0), ::2, ::2]
             run = f"{clip.episode.run}, " if len(trainings) > 1 else ""
             label = f"{short_name(name)}, {run}{clip.episode.engine}"
             column.append(np.stack([add_caption(picture, [label], 1) for picture in half]))
         films.append(np.concatenate(column, axis=1))
-    write_whole(out, encode_mp4(np.concatenate(films, axis=2), every[-1].fps))
+    write_whole(out, encode_mp4(np.concatenate(films, axis=2), fps))
     return tuple(columns)
+
+
+def at_one_rate(clips: Sequence[Clip]) -> tuple[list[np.ndarray], float]:
+    """Return the frames of each clip that one film of all shows, each clip at its own speed, and the film's frames per
+    second. A clip that is over ends with a still."""
+    fps = max(clip.fps for clip in clips)
+    length = 1 + max(round((len(clip.frames) - 1) * fps / clip.fps) for clip in clips)
+    shown = []
+    for clip in clips:
+        nearest = np.rint(np.arange(length) * clip.fps / fps).astype(int)
+        shown.append(np.minimum(nearest, len(clip.frames) - 1))
+    return shown, fps

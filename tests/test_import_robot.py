@@ -338,6 +338,13 @@ class Toy(Robots):
             joint = tree.joint(name)
             self.assertEqual([joint.effort, joint.stiffness], drive)
 
+    def test_the_armature_of_joints_without_a_position_actuator(self):
+        text = MJCF.replace('name="f1_2"', 'name="f1_2" armature="2e-4"', 1)
+        text = text.replace('name="f2_1"', 'name="f2_1" armature="3e-4"', 1)
+        tree, _ = self.read("hand.xml", text)
+        self.assertEqual(tree.joint("f1_2").rotor, 2e-4, "it follows f1_1")
+        self.assertEqual(tree.joint("f2_1").rotor, 3e-4, "it has no actuator")
+
     def test_the_effort_of_a_joint_with_several_actuators_or_a_limit_of_its_own(self):
         text = MJCF.replace("</actuator>", '<velocity joint="f1_1" kv="1"/></actuator>')
         self.assertEqual(self.read("damped.xml", text)[0].joint("f1_1").effort, 2.0)

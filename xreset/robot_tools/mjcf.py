@@ -104,7 +104,6 @@ def read_mjcf(path: Path, notes: list[str]) -> RobotTree:
         stated = {"effort": max(limit, joints[name].effort)}
         if gain > 0 and kp > 0 and lever > 0:
             stated["stiffness"] = kp * lever**2
-            stated["rotor"] = float(model.dof_armature[model.jnt_dofadr[joint]])
         joints[name] = replace(joints[name], **stated)
     tree = replace(tree, joints=tuple(joints.values()))
     check_tree(tree)
@@ -379,10 +378,11 @@ def _link(
 
 
 def _motion(model: mujoco.MjModel, couplings: Couplings, number: int) -> dict[str, Any]:
-    """Return a joint's name, type, limits and what it follows."""
+    """Return a joint's name, type, rotor, limits and what it follows."""
     name = joint_name(model, number)
     is_slide = model.jnt_type[number] == SLIDE
     motion: dict[str, Any] = {"name": name, "type": "prismatic" if is_slide else "revolute"}
+    motion["rotor"] = float(model.dof_armature[model.jnt_dofadr[number]])
     if model.jnt_limited[number]:
         motion["lower"], motion["upper"] = model.jnt_range[number].tolist()
     line = couplings.lines.get(number)

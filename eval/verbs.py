@@ -24,6 +24,7 @@ from xreset.files.checks import (
     obeys_rules,
 )
 from xreset.files.progress import NamedProgress, Progress, unseen
+from xreset.files.records import replaces
 from xreset.files.storage import claim_folder, must_be_new
 from xreset.files.text import quantity
 from xreset.physics.plugins import Device
@@ -373,7 +374,7 @@ def export_deploy(
 @obeys_rules
 def export_episodes(
     folders: str | Path | Sequence[str | Path],
-    out: Output,
+    out: Annotated[Output, replaces("xreset-rollouts/")],
     *,
     engines: Annotated[str | Sequence[str], Option("engine")] = (),
     robot: str | Path | None = None,

@@ -16,11 +16,13 @@ from typing import Annotated
 from unittest import TestCase
 from unittest.mock import Mock, patch
 
+import numpy as np
 import tyro
 
 from tests.command import calls_of, refused, started, succeeds
 from tests.command import xreset as run
 from tests.data import InFolder
+from xreset import synthesize, write_demos
 from xreset.backends import pybullet
 from xreset.cameras.config import WRIST
 from xreset.cli import COMMANDS, _terminal, _verbs
@@ -29,6 +31,7 @@ from xreset.cli._verbs import verb
 from xreset.errors import XResetError
 from xreset.files.checks import Option, Output, PositiveInt
 from xreset.files.progress import unseen
+from xreset.files.records import write_npz
 from xreset.files.storage import claim_folder
 from xreset.learning import verbs
 
@@ -498,6 +501,40 @@ class VerbTest(TestCase):
 
 
 class OutputTest(InFolder):
+    def test_an_output_replaces_no_file_of_another_kind(self):
+        demos = self.folder / "demos.npz"
+        write_demos(demos, synthesize(["soup"], 1, fps=10))
+        motion = self.folder / "motion.npz"
+        write_npz(motion, "xreset-retargeted/1", {})
+        mine = self.folder / "mine.npz"
+        np.savez(mine, my_own=1)
+        text = self.folder / "package.json"
+        text.write_text('{"name": "mine"}')
+        another = r"of another kind \('xreset-{}/1'\)\. Nothing was overwritten; choose"
+        own = "not one of xreset's"
+        for command, out, words in (
+            ("demos synth --objects soup", motion, another.format("retargeted")),
+            ("demos import dexycb none", mine, own),
+            ("demos import keypoints none --order mano --units m --coordinates table", text, own),
+            ("demos select none.npz", mine, own),
+            ("demos select none.npz --out new.npz --rest", motion, another.format("retargeted")),
+            ("retarget none.npz --robot openarm", demos, another.format("demos")),
+            ("resets none.npz", motion, another.format("retargeted")),
+            ("goals soup --robot openarm", demos, another.format("demos")),
+            ("engines check", text, own),
+            ("engines compare none.npz", text, own),
+            ("export episodes none", demos, another.format("demos")),
+        ):
+            with self.subTest(command):
+                before = out.read_bytes()
+                flag = "" if command.endswith("--rest") else "--out"
+                self.assertRegex(refused(command, flag, out), words)
+                self.assertEqual(out.read_bytes(), before)
+        empty = self.folder / "empty.npz"
+        empty.touch()
+        for out in (empty, empty, demos):  # of its own kind
+            succeeds("demos synth --objects soup --per-object 1 --out", out)
+
     def test_a_read_only_folder_is_refused_at_once(self):
         with patch("xreset.files.checks.os.access", return_value=False):
             said = refused("retarget none --robot openarm --out", self.folder / "new/motion.npz")

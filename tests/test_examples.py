@@ -53,7 +53,7 @@ class FaceTest(TestCase):
         }
         # of functions that are commands, too
         elsewhere |= {"Annotated", "Device", "Option", "Output", "Port", "Pose", "Png", "Rate"}
-        elsewhere |= {"Progress", "NamedProgress", "OutputFile", "Onnx", "Mp4"}
+        elsewhere |= {"Progress", "NamedProgress", "OutputFile", "ArchiveFile", "Onnx", "Mp4"}
         functions = 0
         for name in xreset.__all__:
             value = getattr(xreset, name)

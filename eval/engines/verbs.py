@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from xreset.files.checks import Json, JsonOrPage, Option, PositiveInt, obeys_rules
 from xreset.files.progress import NamedProgress, unseen
+from xreset.files.records import replaces
 from xreset.files.storage import file_hash, measured, write_json, write_whole
 from xreset.physics.plugins import Device
 
@@ -30,7 +31,7 @@ def check_engines(
     robot: str | Path | None = None,
     device: Device = "cpu",
     only: Annotated[Sequence[str], Option("check")] = (),
-    out: JsonOrPage | None = None,
+    out: Annotated[JsonOrPage, replaces("xreset-")] | None = None,
     say: Callable[[Any], None] = print,
 ) -> list[dict[str, Any]]:
     """Test whether physics engines keep their contract. The command exits with 1 if one does not.
@@ -77,7 +78,7 @@ def compare_engines(
     names: Annotated[Sequence[str], Option("object")] = (),
     grasps: PositiveInt = 48,
     device: Device = "cpu",
-    out: Json | None = None,
+    out: Annotated[Json, replaces("xreset-")] | None = None,
     progress: NamedProgress = unseen,
 ) -> Parity:
     """Measure how far physics engines agree with MuJoCo on grasps. The command exits with 1 if one misses a target.

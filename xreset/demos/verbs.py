@@ -24,7 +24,7 @@ from xreset.files.checks import (
     obeys_rules,
 )
 from xreset.files.progress import Progress, unseen
-from xreset.files.records import RATE
+from xreset.files.records import RATE, replaces
 from xreset.files.storage import file_hash
 
 if TYPE_CHECKING:
@@ -32,13 +32,14 @@ if TYPE_CHECKING:
 else:  # a command has files in place of these
     Demos = Any
 
+ArchiveFile = Annotated[OutputFile, replaces("xreset-demos/")]
 Rate = Annotated[
     float, Rule(f"a number from {RATE[0]:g} to {RATE[1]:g}", lambda x: RATE[0] <= x <= RATE[1])
 ]
 
 
 @obeys_rules
-def import_dexycb(folder: str | Path, out: OutputFile, *, progress: Progress = unseen) -> Demos:
+def import_dexycb(folder: str | Path, out: ArchiveFile, *, progress: Progress = unseen) -> Demos:
     """Read DexYCB in its own layout and write an archive of demonstrations.
 
     Args:
@@ -60,7 +61,7 @@ def import_dexycb(folder: str | Path, out: OutputFile, *, progress: Progress = u
 @obeys_rules
 def import_keypoints(
     path: str | Path,
-    out: OutputFile | None = None,
+    out: ArchiveFile | None = None,
     *,
     order: Literal["mano", "mediapipe", "openpose"],
     units: Literal["m", "mm"],
@@ -129,7 +130,7 @@ def synthesize(
     per_object: PositiveInt = 4,
     seed: Seed = 0,
     *,
-    out: OutputFile | None = None,
+    out: ArchiveFile | None = None,
     fps: Annotated[float, Option(None)] = 30.0,
     side: Literal["right", "left", "both"] = "right",
     meshes: str | Path | None = None,
@@ -205,8 +206,8 @@ class Selection(Options):
 def select_demos(
     files: Sequence[str | Path],
     *,
-    out: OutputFile | None = None,
-    rest: OutputFile | None = None,
+    out: ArchiveFile | None = None,
+    rest: ArchiveFile | None = None,
     selection: Selection = Selection(),
     mirror: bool = False,
     meshes: str | Path | None = None,

@@ -12,7 +12,7 @@ import json
 import math
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, fields, replace
 from functools import cache
 from pathlib import Path
@@ -21,7 +21,7 @@ from typing import Any, TypeVar, get_type_hints
 import numpy as np
 
 from xreset.errors import FileFormatError, XResetError
-from xreset.files.checks import marks_of
+from xreset.files.checks import Check, marks_of
 from xreset.files.storage import (
     RAISE_LIMIT,
     atomic_write,
@@ -29,6 +29,7 @@ from xreset.files.storage import (
     code_version,
     max_bytes,
     must_exist,
+    read_json,
     stated_path,
 )
 from xreset.files.text import is_plain, plain, shown
@@ -188,6 +189,31 @@ def npz_schema(path: str | Path, *, what: str = "one of xreset's npz files") -> 
     if stated is None:
         raise FileFormatError(f"{path} is not {what}: it states no schema. Is it the right file?")
     return stated
+
+
+def replaces(kind: str) -> Check:
+    """Return the check of an output file that refuses to replace a file of another kind.
+
+    Args:
+        kind: beginning of the schema that the output states. A file without content, and a page (.md), may be replaced.
+    """
+
+    def refuse_other(path: str | Path) -> None:
+        path = Path(path)
+        if not path.is_file() or not path.stat().st_size or path.suffix.lower() == ".md":
+            return
+        stated: Any = None
+        for schema_of_file in (npz_schema, lambda file: read_json(file).get("schema")):
+            with suppress(FileFormatError):
+                stated = schema_of_file(path)
+        if not isinstance(stated, str) or not stated.startswith(kind):
+            found = f"of another kind ({shown(stated)})" if stated else "not one of xreset's"
+            raise XResetError(
+                f"cannot write {path}: a file of this name exists, and is {found}. Nothing was overwritten; choose"
+                " another name, or remove the file."
+            )
+
+    return Check(refuse_other)
 
 
 @contextmanager

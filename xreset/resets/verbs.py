@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from xreset.files.checks import Option, OutputFile, PositiveInt, obeys_rules
 from xreset.files.progress import NamedProgress, Progress, unseen
+from xreset.files.records import replaces
 from xreset.physics.plugins import Device
 from xreset.resets.config import (
     ClosingConfig,
@@ -42,7 +43,7 @@ def make_bank(
     objects: Sequence[ObjectSpec] | None = None,
     engine: str | Sequence[str] = "mujoco",
     *,
-    out: OutputFile | None = None,
+    out: Annotated[OutputFile, replaces("xreset-resets/")] | None = None,
     meshes: str | Path | None = None,
     num_envs: PositiveInt = 64,
     device: Device = "cpu",
@@ -145,7 +146,7 @@ def make_goals(
     names: Sequence[str] | None = None,
     *,
     robot: str | Path | RobotSpec,
-    out: OutputFile | None = None,
+    out: Annotated[OutputFile, replaces("xreset-goals/")] | None = None,
     meshes: str | Path | None = None,
     families: Annotated[str | Sequence[str] | None, Option("family")] = None,
     poses: Annotated[Sequence[Pose], Option("pose")] = (),

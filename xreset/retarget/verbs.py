@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from xreset.files.checks import Option, OutputFile, obeys_rules
 from xreset.files.progress import Progress, unseen
+from xreset.files.records import replaces
 from xreset.files.storage import file_hash
 from xreset.physics.plugins import Device
 
@@ -34,7 +35,7 @@ def retarget_demos(
     objects: Sequence[ObjectSpec] | None = None,
     config: RetargetConfig | None = None,
     *,
-    out: OutputFile | None = None,
+    out: Annotated[OutputFile, replaces("xreset-retargeted/")] | None = None,
     meshes: str | Path | None = None,
     trust: Annotated[bool, Option("trust_recordings")] = False,
     device: Device = "cpu",

@@ -32,7 +32,7 @@ def batches(jobs: np.ndarray, *, small: int, most: int) -> list[np.ndarray]:
         most: most jobs of a batch.
     """
     count = 2 * -(-len(jobs) // (2 * most)) if len(jobs) > small else 1
-    return np.array_split(jobs, count)
+    return np.array_split(jobs, count) if len(jobs) else []
 
 
 def in_processes(function: Callable[[_Job], _Result], jobs: Sequence[_Job]) -> Iterator[_Result]:

@@ -11,6 +11,7 @@ import torch
 from numpy.testing import assert_allclose
 from torch import tensor
 from torch.testing import assert_close
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from tests.command import succeeds, xreset
 from tests.data import InFolder, refuses
@@ -22,7 +23,7 @@ from xreset.geometry.kinematics import Kinematics
 from xreset.physics.plugins import DESCRIPTION, robot_folder
 from xreset.retarget.arm.config import ArmSearch
 from xreset.retarget.arm.model import ArmModel, ArmTargets
-from xreset.retarget.arm.solve import splice, spread_over, track
+from xreset.retarget.arm.solve import branches, splice, spread_over, track
 from xreset.retarget.validity import Thresholds, classify
 from xreset.robot_tools import place as placing
 from xreset.robot_tools.placement import Finalist, PlaceConfig, write_placement
@@ -157,6 +158,20 @@ class PlaceTest(InFolder):
         assert_close(frames.root_pos[3], self.wrists.root_pos[4])
 
 
+class Sizes(TorchDispatchMode):
+    """Notes the memory of every tensor that is made [bytes]."""
+
+    def __init__(self):
+        super().__init__()
+        self.found = []
+
+    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+        made = function(*args, **(kwargs or {}))
+        if isinstance(made, torch.Tensor):
+            self.found.append(made.untyped_storage().nbytes())
+        return made
+
+
 class DirectionTest(TestCase):
     """Motions that the arm can follow from one of their ends, and not from the other."""
 
@@ -183,6 +198,12 @@ class DirectionTest(TestCase):
     def test_both_ends_are_tried(self):
         for targets in (self.targets, self.targets.reversed()):  # forwards alone: none of the first
             self.assertGreaterEqual(self.valid(targets).sum(), 8)
+
+    def test_restarts_of_the_first_frame_do_not_copy_the_others(self):
+        problem = self.model.problem(self.targets, Thresholds(), ArmSearch(branches=1))
+        with Sizes() as sizes:
+            branches(problem)
+        self.assertLess(max(sizes.found), 8 * problem.hand_poses.nbytes)
 
     def test_frames_between_two_bad_ends_are_found_from_the_middle(self):
         both = ArmTargets.cat((self.targets, self.targets.reversed()), dim=1)

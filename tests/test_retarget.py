@@ -29,7 +29,7 @@ from xreset.retarget.arm.config import ArmSearch
 from xreset.retarget.arm.model import ArmModel
 from xreset.retarget.arm.solve import Paths, best_path, track
 from xreset.retarget.file import SCHEMA, Retargeted
-from xreset.retarget.hand import terms
+from xreset.retarget.hand import solve, terms
 from xreset.retarget.hand.clearance import Objects, contact_distance, too_near
 from xreset.retarget.hand.config import HandWeights
 from xreset.retarget.hand.cost import system
@@ -111,6 +111,15 @@ class HandTest(TestCase):
         limits = (config.object_clearance, config.self_depth)
         frames = self.in_frames(targets, state)
         return too_near(self.model, *frames, targets.annotated.flatten(), *limits)
+
+    def test_frames_without_a_hand_begin_with_the_nearest_frame_with_one(self):
+        """In memory for a few numbers of each frame: one for each pair of frames would take 80 GB."""
+        seen = torch.zeros(2, 100_000, dtype=torch.bool)
+        seen[0, [2, 6, 7]] = True
+        seen[1, -1] = True
+        found = solve.nearest_annotated(seen)
+        self.assertEqual(found[0, :9].tolist(), [2, 2, 2, 2, 2, 6, 6, 7, 7])
+        self.assertEqual(found[1].unique().tolist(), [99_999])
 
     def test_contacts_are_measured_from_the_surface_of_the_rigid_link(self):
         """Balls of 1 cm around the origins of the fingertip and, 3 cm behind it, of the link that carries it."""
@@ -453,6 +462,12 @@ class PipelineTest(InOneFolder):
         self.assertEqual(self.result.first_contact[1], -1)
         assert_array_equal(np.isinf(self.result.hand_error), ~self.result.annotated)
         assert_array_equal(self.result.goal_pos[1], self.result.object_pos[-1])
+
+    def test_without_any_hand_every_sequence_stays_at_home(self):
+        no_hand = self.demos.select(indices=[1])
+        found = retarget_demos(no_hand, self.robot, self.objects, self.config)
+        assert_array_equal(found.joint_pos, self.result.joint_pos[self.second])
+        assert_array_equal(found.reason, self.result.reason[self.second])
 
     def test_a_file_comes_back_and_the_same_inputs_give_the_same_file(self):
         """With any number of threads, of which the hand uses one."""

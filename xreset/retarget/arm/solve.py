@@ -272,7 +272,7 @@ def _first_frame_solutions(problem: ArmProblem) -> Tensor:
     home = problem.model.home
     sequences = len(problem.hand_poses)
     start = _random_starts(problem.model, config)
-    frame = problem.repeated(config.restarts)[:, 0]
+    frame = problem[:, :1].repeated(config.restarts)[:, 0]
     solved = solve(frame, start.repeat(sequences, 1), config.first_iterations)
     cost = system(frame, solved).cost
     shape = (sequences, config.restarts)

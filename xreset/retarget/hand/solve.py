@@ -56,7 +56,7 @@ def retarget_hand(
     device = targets.keypoints.device
     targets = targets.to(model.device)
     rows = torch.arange(len(targets.annotated), device=model.device)[:, None]
-    nearest = _nearest_annotated(targets.annotated)
+    nearest = nearest_annotated(targets.annotated)
     root_pos, root_quat = _align_root(model, targets.keypoints[rows, nearest])
     joints = model.kinematics.clamp(model.home).expand(*targets.annotated.shape, -1)
     state = HandState(joints, root_pos, root_quat)
@@ -103,7 +103,7 @@ def _align_root(model: HandModel, human: Tensor) -> tuple[Tensor, Tensor]:
     return pos, matrix_to_quat(rot)
 
 
-def _nearest_annotated(annotated: Tensor) -> Tensor:
+def nearest_annotated(annotated: Tensor) -> Tensor:
     """[S, T] the annotated frame that is nearest to each frame.
 
     Raises:
@@ -111,9 +111,11 @@ def _nearest_annotated(annotated: Tensor) -> Tensor:
     """
     if not annotated.any(dim=1).all():
         raise ValueError("A sequence has no annotated frame. Select sequences that have one.")
-    time = torch.arange(annotated.shape[1], device=annotated.device)
-    distance = (time[:, None] - time).abs().expand(len(annotated), -1, -1)
-    return distance.masked_fill(~annotated[:, None, :], len(time) * 2).argmin(dim=-1)
+    count = annotated.shape[1]
+    time = torch.arange(count, device=annotated.device)
+    before = torch.where(annotated, time, -count).cummax(dim=1).values
+    after = torch.where(annotated, time, 2 * count).flip(1).cummin(dim=1).values.flip(1)
+    return torch.where(time - before <= after - time, before, after)
 
 
 def _moved(model: HandModel, state: HandState, step: Tensor) -> HandState:

@@ -105,6 +105,15 @@ class Synthetic(InFolder):
         found = read_keypoints(self.npz(subject=np.array("ann")), PLAIN)
         self.assertEqual(found.subject.tolist(), ["ann"])
 
+    def test_spaces_around_the_cells_of_a_table_do_not_count(self):
+        path = self.folder / "a.csv"
+        names = ["a", " a", "a "] * len(self.points)
+        columns = {"sequence": names[: len(self.points)], "object": " soup", "side": " right"}
+        write_csv(path, self.points, self.demos.object_pos, self.turn, columns=columns)
+        found = read_keypoints(path, PLAIN)
+        self.same(found)
+        self.assertEqual(found.sequence_name.tolist(), ["a"])
+
     def test_quaternions_say_their_order(self):
         wxyz = self.demos.object_quat_wxyz
         xyzw = np.roll(wxyz, -1, axis=1)
@@ -140,6 +149,8 @@ class Synthetic(InFolder):
         other = "It is the other hand .*or the coordinates are left-handed"
         self.refused(other, side=np.array("left"))
         self.refused("file says 20 frames per second, but --fps says 10", fps=np.array(20.0))
+        single = self.npz(fps=np.float32(29.97))
+        self.assertEqual(read_keypoints(single, replace(PLAIN, fps=29.97)).fps, 29.97)
         for words, changes in (
             ("Is the unit right", {"units": "mm"}),
             ("--order mediapipe", {"order": "mano"}),

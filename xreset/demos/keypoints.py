@@ -41,6 +41,8 @@ MAX_FRAMES = 100_000
 _KNUCKLES = [0, 5, 9, 13, 17]
 _UNEVEN = 0.1
 """Largest relative deviation of a time step from the median one for frames that count as evenly spaced."""
+_SAME_RATE = 1e-3
+"""Relative difference of rates that count as one."""
 _GAP = 0.3
 """Longest time between two frames over which the hand and a moving object are interpolated [s]."""
 _GAP_MOTION = 0.02
@@ -196,7 +198,7 @@ def _read_csv(path: Path, name: str) -> Iterator[Arrays]:
         for text in ("object", "side", "subject"):
             if text not in table:
                 continue
-            values = {table[text][frame].strip() for frame in own}
+            values = {table[text][frame] for frame in own}
             if len(values) > 1:
                 raise DemoError(
                     f"{path}, sequence {sequence}: the column {text} changes: {shown(sorted(values))}."
@@ -213,10 +215,14 @@ def _table(path: Path) -> dict[str, list[str]]:
         )
     with open(path, newline="", encoding="utf-8-sig") as file:
         lines = csv.reader(file, strict=True)
-        rows = [(lines.line_num, row) for row in lines if row and not row[0].startswith("#")]
+        rows = [
+            (lines.line_num, [*map(str.strip, row)])
+            for row in lines
+            if row and not row[0].startswith("#")
+        ]
     if len(rows) < 2:
         raise ValueError("it has no frame")
-    names = [name.strip() for name in rows[0][1]]
+    names = rows[0][1]
     for separator, word in ((";", "semicolons"), ("\t", "tabs")):
         if len(names) == 1 and separator in names[0]:
             raise ValueError(
@@ -241,7 +247,7 @@ def _table(path: Path) -> dict[str, list[str]]:
 
 def _numbers(table: dict[str, list[str]], column: str) -> np.ndarray:
     try:
-        return np.array([float(cell.strip() or "nan") for cell in table[column]])
+        return np.array([float(cell or "nan") for cell in table[column]])
     except ValueError as error:
         raise ValueError(
             f"column {column}: {error}. Leave cells empty where the hand was not seen"
@@ -365,11 +371,10 @@ def _evenly(arrays: Arrays, convention: Convention, motion: Motion) -> tuple[flo
         rate = float(arrays["fps"]) if "fps" in arrays else convention.fps
         if rate is None:
             raise DemoError("it has neither times nor a rate. Add --fps, the frames per second.")
-        if convention.fps not in (None, rate):
-            raise DemoError(
-                f"the file says {rate:g} frames per second, but --fps says {convention.fps:g}."
-            )
-        return rate, motion
+        stated = convention.fps or rate
+        if abs(stated / rate - 1) > _SAME_RATE:  # single precision has not all digits of 29.97
+            raise DemoError(f"the file says {rate:g} frames per second, but --fps says {stated:g}.")
+        return stated, motion
     time = np.asarray(arrays["time"], dtype=float)
     steps = np.diff(time)
     if not (steps > 0).all():
@@ -397,7 +402,7 @@ def _evenly(arrays: Arrays, convention: Convention, motion: Motion) -> tuple[flo
         )
     own = _rate(time) if even else own
     rate = convention.fps or own
-    if even and abs(rate / own - 1) < 1e-3:
+    if even and abs(rate / own - 1) < _SAME_RATE:
         return rate, motion
     return rate, _resampled(time, rate, motion)
 

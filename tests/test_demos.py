@@ -220,6 +220,17 @@ class Archive(InFolder):
         write_demos(file, self.changed(3, object_name="banana"))  # the paper's name
         self.assertEqual([*demo_objects(read_demos(file))], ["005_tomato_soup_can", "011_banana"])
 
+    def test_an_object_and_its_mesh_have_one_name(self):
+        for mesh in ("025_mug", "soup"):  # an official name stays, whatever the mesh is called
+            trimesh.creation.box((0.05, 0.06, 0.07)).export(self.folder / f"{mesh}.obj")
+        self.assertEqual(
+            [*demo_objects(self.demos.select(indices=[0]), self.folder)],
+            ["005_tomato_soup_can"],
+        )
+        words = "name an object 'mug', which is '025_mug' here. Rename its mesh, or"
+        with self.assertRaisesRegex(DemoError, words):
+            demo_objects(self.changed(0, object_name="mug").select(indices=[0]), self.folder)
+
     def test_levelled_applies_the_subjects_transform_once(self):
         T = np.eye(4)
         T[:3, :3] = Rotation.from_rotvec([0.02, 0, 0]).as_matrix()

@@ -33,6 +33,7 @@ from xreset.files.text import Brief, shown
 from xreset.geometry.shapes import quat_of, turn_of
 from xreset.objects.catalogue import canonical_names, load_object, object_names, official_name
 from xreset.objects.rest import rest_height
+from xreset.objects.standins import STAND_INS
 from xreset.spec import ObjectSpec, objects_named
 
 SCHEMA_NAME = "xreset-demos/1"
@@ -449,17 +450,24 @@ def demo_objects(demos: Demos, meshes: str | Path | None = None) -> dict[str, Ob
     """Return the objects of the demonstrations by name: stand-ins, or the meshes of a folder.
 
     Raises:
-        DemoError: objects are unknown; the message names all of them, and the known objects.
+        DemoError: objects are unknown, in which case the message names all of them and the known objects, or have
+            another name.
         ObjectError: a mesh cannot be used.
     """
     names = list(dict.fromkeys(demos.object_name.tolist()))
     try:
-        canonical_names(names, object_names(meshes))
+        found = canonical_names(names, object_names(meshes))
     except ObjectError as error:
         hint = "" if meshes else " Or give a folder of meshes (meshes=... or --meshes)."
         raise DemoError(
             f"The demonstrations need objects that are not there. {error}{hint}"
         ) from None
+    for name, full in zip(names, found, strict=True):
+        if full != name and name not in STAND_INS:
+            raise DemoError(
+                f"The demonstrations name an object {shown(name)}, which is {shown(full)} here. Rename its mesh, or"
+                " make the demonstrations with this name."
+            )
     return {name: load_object(name, meshes) for name in names}
 
 

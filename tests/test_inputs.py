@@ -100,6 +100,8 @@ class InputsTest(InOneFolder):
         words = f"made with an imported mesh of {SOUP}, but the given one is another mesh.*--meshes"
         with self.assertRaisesRegex(FileFormatError, words):
             load_inputs(file, meshes=other)
+        with self.assertRaisesRegex(FileFormatError, "but the given one is the built-in stand-in"):
+            load_inputs(file, objects=[load_object(SOUP)])
         for wrong in (None, "gone", "a\0b", 3):
             write_retargeted(file, motion, config={"meshes": wrong}, inputs=inputs)
             with refuses(self, "--meshes", XResetError, wrong):

@@ -178,6 +178,7 @@ def load_inputs(
             loaded = load_objects(names, folder)
         else:
             loaded = checked_objects(load_robot(robot), objects)
+            check_sources(str(path or "the data"), stated, {o.name: o.source for o in loaded})
     robot_name = None
     spec = None
     if robot is not None:

@@ -12,6 +12,7 @@ from tests.toy_bank import ONLY_FRAMES, SOUP, SPAM, in_this_process, toy_retarge
 from xreset import FilterConfig, SqueezeConfig, robots
 from xreset.errors import DemoError
 from xreset.geometry.kinematics import Kinematics
+from xreset.geometry.shapes import transform
 from xreset.objects.catalogue import load_objects
 from xreset.objects.rest import rest_height
 from xreset.physics import Health, State
@@ -58,7 +59,8 @@ class RejectionTest(TestCase):
             backend = SimpleNamespace(
                 state=lambda state=state: state,
                 health=lambda health=health: health,
-                scene=SimpleNamespace(table=table),
+                scene=SimpleNamespace(table=table, objects=[SimpleNamespace(com=np.zeros(3))]),
+                object_index=torch.tensor([0]),
                 num_worlds=1,
                 device="cpu",
             )
@@ -85,6 +87,20 @@ class FilterTest(TestCase):
             motion = toy_retargeted(self.robot, [SOUP], [0, 1], object_pos=np.array([pos]))
             bank = make_bank(motion, self.robot, self.objects[:1], **ONLY_FRAMES)
             with self.subTest(pos):
+                self.assertEqual(reasons(bank), expected)
+
+    def test_the_origin_of_a_mesh_may_be_anywhere(self):
+        soup = self.objects[0]
+        for x, origin, expected in ((0.5, 2.0, []), (2.0, 0.5, ["out of bounds"])):
+            shift = np.array([x - origin, 0.0, 0.0])
+            move = transform(np.eye(3), shift)
+            pieces = [replace(p, T_body_shape=move @ p.T_body_shape) for p in soup.pieces]
+            changes = {"com": soup.com + shift, "vertices": soup.vertices + shift}
+            moved = replace(soup, pieces=tuple(pieces), **changes)
+            pos = np.array([[x, 0.3, self.height]]) - shift
+            motion = toy_retargeted(self.robot, [SOUP], [0, 1], object_pos=pos)
+            bank = make_bank(motion, self.robot, [moved], **ONLY_FRAMES)
+            with self.subTest(x):
                 self.assertEqual(reasons(bank), expected)
 
     def retargeted(self, **changes):

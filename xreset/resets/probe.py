@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from xreset.files.progress import Progress, unseen
+from xreset.geometry.rotations import quat_rotate
 from xreset.physics import Backend, State
 from xreset.physics.plugins import device_for, make_backend
 from xreset.resets.config import FilterConfig
@@ -128,8 +129,12 @@ def rejection(backend: Backend, start: State, limits: FilterConfig) -> Tensor:
     accepted."""
     state = backend.state()
     health = backend.health()
+    # the origin of a mesh may be anywhere
+    coms = torch.as_tensor(np.stack([obj.com for obj in backend.scene.objects]))
+    com = coms.to(state.object_pos)[backend.object_index]
+    place = state.object_pos + quat_rotate(state.object_quat, com)
     tests = (
-        out_of_bounds(state.object_pos, backend.scene.table),
+        out_of_bounds(place, backend.scene.table),
         state.object_linvel.norm(dim=-1) > limits.linear_velocity,
         state.object_angvel.norm(dim=-1) > limits.angular_velocity,
         state.joint_vel.abs().amax(dim=-1) > limits.joint_velocity,

@@ -23,6 +23,7 @@ from xreset.demos.archive import (
     write_demos,
 )
 from xreset.demos.dexycb import read_dexycb
+from xreset.demos.examine import examine, surfaces_of
 from xreset.demos.grasp import TIPS, Solid
 from xreset.errors import DemoError, FileFormatError, XResetError
 from xreset.files.text import quantity
@@ -491,6 +492,18 @@ class Synthetic(InFolder):
         inside = radius < 0.0365
         self.assertTrue(((radius < 0.040) == inside).all(), radius)  # none is in the wall
         self.assertEqual([inside[0] != inside[1], inside[1] == inside[2]], [True, True])
+
+    def test_the_origin_of_ones_own_mesh_may_be_anywhere(self):
+        found = []
+        shift = np.array([0.5, 0.9, 0.4])
+        for at in (np.zeros(3), shift):
+            mesh = trimesh.creation.box((0.05, 0.06, 0.12))
+            mesh.apply_translation(at).export(self.folder / "brick.obj")
+            found.append(synthesize(None, per_object=2, seed=0, fps=10, meshes=self.folder))
+            self.assertEqual(examine(found[-1], surfaces_of(found[-1], self.folder)), [])
+        centered, moved = found
+        middle = moved.object_pos + turn_of(moved.object_quat_wxyz).apply(shift)
+        assert_allclose(middle, centered.object_pos, atol=0.002)
 
     def test_a_line_enters_and_leaves_a_box_or_misses_it(self):
         box = load_object("003_cracker_box")

@@ -250,13 +250,17 @@ class Recording:
         return base, begin, step[begin]
 
     @cached_property
+    def start_place(self) -> np.ndarray:
+        """[3] the object's center of mass in the first frame, or its origin if its mesh is unknown [m]."""
+        if self.surface is None:
+            return self.pos[0]
+        return self.pos[0] + self.turn[0].apply(self.surface.obj.com)
+
+    @cached_property
     def off_table(self) -> float:
         """Distance from the object to the table's top in the first frame, from above; 0 above it [m]."""
-        at = self.pos[0]
-        if self.surface is not None:
-            at = at + self.turn[0].apply(self.surface.obj.com)
         table = TableSpec()
-        beyond = np.abs(at[:2] - table.center) - table.half_size[:2]
+        beyond = np.abs(self.start_place[:2] - table.center) - table.half_size[:2]
         return float(np.linalg.norm(beyond.clip(0.0)))
 
     @cached_property
@@ -356,7 +360,7 @@ def _of_hand(r: Recording) -> Iterator[Contradiction]:
             f"the hand moves past the object at {slip:.1f} times the object's speed", False
         )
     if r.seen.any():
-        ahead = float(r.points[np.argmax(r.seen), 0, 1] - r.pos[0, 1])
+        ahead = float(r.points[np.argmax(r.seen), 0, 1] - r.start_place[1])
         if ahead < _BEHIND:
             yield Contradiction(
                 "the hand comes from the -y side, but the person should be at +y", False

@@ -23,9 +23,10 @@ from xreset.demos.grasp import Contacts, Grasp, Solid, fit_hand, handedness, pla
 from xreset.errors import DemoError
 from xreset.files.processes import in_processes
 from xreset.files.progress import Progress
-from xreset.geometry.shapes import turn_of
+from xreset.geometry.shapes import transform, turn_of
 from xreset.objects.catalogue import load_objects
 from xreset.objects.rest import rest_height, resting_orientation
+from xreset.objects.sampling import bounding_box
 from xreset.spec import ObjectSpec
 
 SUBJECT = "synthetic"
@@ -65,6 +66,8 @@ GOAL_ROLL = (np.radians(-85.0), np.radians(90.0))
 """Angle of the palm at the goal about the fingers: at -90 degrees it faces down, at 90 up, and at 0 a right hand's
 faces +x. 90 is the 95th percentile of turns of over 120 degrees (66 that of all)."""
 
+_NEAR_MIDDLE = 0.03
+"""Farthest that an object's origin may be from the middle of its bounding box [m]: 0.029 in the YCB set."""
 _BATCH = 10
 """Sequences that a process makes before it reports: a few seconds, or a minute with a complicated mesh."""
 _FEW = 16
@@ -123,12 +126,15 @@ class _Batch(NamedTuple):
 def _sequences(batch: _Batch) -> list[Demos]:
     """Make the sequences of a batch; a function of a module, for other processes."""
     obj, side, seed, fps, indices = batch
+    obj, moved = _centered(obj)
     starts = _Starts(obj, side)
     parts = []
     for index in indices:
         name = f"{SUBJECT}/{obj.name}_{side}_{seed}_{index:03d}"
         rng = np.random.default_rng([seed, index, zlib.crc32(obj.name.encode()), side == "left"])
-        parts.append(_sequence(obj, starts, name, side, fps, rng))
+        demos = _sequence(obj, starts, name, side, fps, rng)
+        shift = turn_of(demos.object_quat_wxyz).apply(moved).astype(np.float32)
+        parts.append(replace(demos, object_pos=demos.object_pos - shift))
     return parts
 
 
@@ -170,6 +176,19 @@ def _sequence(
         object_pos=object_pos,
         object_rot=object_rot,
     )
+
+
+def _centered(obj: ObjectSpec) -> tuple[ObjectSpec, np.ndarray]:
+    """Return an object whose origin is near the middle of its bounding box, and how far its origin was moved [3] [m].
+    Places, lifts and turns are those of the origin."""
+    low, high = bounding_box(obj)
+    middle = (low + high) / 2
+    if np.linalg.norm(middle) <= _NEAR_MIDDLE:
+        return obj, np.zeros(3)
+    back = transform(np.eye(3), -middle)
+    pieces = [replace(piece, T_body_shape=back @ piece.T_body_shape) for piece in obj.pieces]
+    vertices = obj.vertices - middle
+    return replace(obj, pieces=tuple(pieces), vertices=vertices, com=obj.com - middle), middle
 
 
 class _Starts:

@@ -41,7 +41,7 @@ CAUSES = {
     "object: positions times 0.01": "a hundredth of what they should be",
     "object: (x, y, z, w) named wxyz": r"in the order \(x, y, z, w\)",
     "mesh: origin 2 cm along x": "with the hand shifted by .* in the object's frame",
-    "time: hand 200 ms late": "with the hand 200 ms late, both move together",
+    "time: hand 200 ms late": "the hand is 200 ms late. Subtract it from its times",
     "time: hand backwards": "played backwards",
     "time: rate times 5": "Is the rate of 150 frames per second right",
     "jump: hand by 30 cm": "The hand jumps in 1 of",

@@ -640,10 +640,9 @@ def _clocks(r: Recording) -> Iterator[Cause]:
         lag = lags[int(np.nanargmin(slips))]
         seconds = abs(lag) / r.fps
         if seconds > _LEAST_LAG:
-            when = "late" if lag > 0 else "early"
+            change = "late. Subtract it from" if lag > 0 else "early. Add it to"
             yield Cause(
-                f"The clocks of hand and object may differ: with the hand {1e3 * seconds:.0f} ms {when}, both move"
-                " together. Shift its times.",
+                f"The clocks of hand and object may differ: the hand is {1e3 * seconds:.0f} ms {change} its times.",
                 replace(r, points=_later(r.points, lag)),
                 _BETTER,
             )

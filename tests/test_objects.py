@@ -474,6 +474,7 @@ class MeshImport(InFolder):
             path = self.folder / f"{name}.obj"
             path.parent.mkdir(exist_ok=True)
             CUBE.export(path)
+        (self.folder / "._011_banana.obj").touch()  # what macOS leaves on other drives
         files = ["011_banana.obj", "024_bowl/textured.obj", "025_mug/textured_simple.obj"]
         self.assertEqual(
             [*mesh_files(self.folder).values()], [self.folder / file for file in files]

@@ -117,7 +117,9 @@ def read_keypoints(
         files = [
             file
             for file in sorted(path.rglob("*"))
-            if file.suffix.lower() in (".npz", ".csv") and file.is_file()
+            if file.suffix.lower() in (".npz", ".csv")
+            and file.is_file()
+            and not file.name.startswith(".")
         ]
         if not files:
             raise DemoError(

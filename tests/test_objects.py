@@ -656,6 +656,12 @@ class RandomShapes(InFolder):
             with self.subTest(words):
                 self.assertIn(words, " ".join(refused("objects import", options).split()))
         self.assertEqual((out / f"{name}.obj").read_bytes(), before)
+        (out / f"{name}.obj").unlink()  # killed between the two files
+        succeeds("objects import scissors --out", out)
+        self.assertEqual((out / f"{name}.obj").read_bytes(), before)
+        (out / f"{name}.obj").unlink()
+        (out / f"{name}.toml").write_text("mass = 0.2")  # the user's own
+        self.assertIn("is there already", refused("objects import scissors --out", out))
 
     def test_a_folder_is_never_overwritten(self):
         taken = self.folder / "taken"

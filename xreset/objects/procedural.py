@@ -65,13 +65,18 @@ def write_stand_in(name: str, folder: str | Path) -> Path:
     """
     obj = stand_in(canonical_name(name))
     path = Path(folder) / f"{obj.name}.obj"
-    for file in (path, path.with_suffix(".toml")):
-        if file.exists():
-            raise ObjectError(
-                f"{file} is there already. Nothing was changed; choose another --out."
-            )
+    facts = path.with_suffix(".toml")
+    # a command that was killed between the two files can be repeated
+    if path.exists() or (facts.exists() and facts.read_bytes() != _facts(obj.mass).encode()):
+        raise ObjectError(
+            f"{path} or its .toml is there already. Nothing was changed; choose another --out."
+        )
     _write(path, _union(obj.pieces), obj.mass)
     return path
+
+
+def _facts(mass: float) -> str:
+    return Properties(mass=round(mass, 4)).to_toml()
 
 
 def _union(pieces: Sequence[Shape]) -> trimesh.Trimesh:
@@ -85,7 +90,7 @@ def _union(pieces: Sequence[Shape]) -> trimesh.Trimesh:
 def _write(path: Path, mesh: trimesh.Trimesh, mass: float) -> None:
     from trimesh.exchange.obj import export_obj
 
-    write_whole(path.with_suffix(".toml"), Properties(mass=round(mass, 4)).to_toml())
+    write_whole(path.with_suffix(".toml"), _facts(mass))
     # fewer digits would open seams
     write_whole(path, export_obj(mesh, digits=12))
 

@@ -84,7 +84,15 @@ class Names(TestCase):
             canonical_names([3])
         for name in ("035_power_drill", "power_drill", "Power Drill"):
             self.assertEqual(canonical_name(name), "035_power_drill")
-        for known, name in (("wine_glass", "glass"), ("big_mug", "mug"), ("2nd_mug", "mug")):
+        # archives have official names, and one's own mesh need not have the number
+        for known in ("mustard_bottle", "Mustard bottle", "mustard"):
+            self.assertEqual(canonical_name("006_mustard_bottle", [known, "1_mustard"]), known)
+        for known, name in (
+            ("wine_glass", "glass"),
+            ("big_mug", "mug"),
+            ("2nd_mug", "mug"),
+            ("1_mug", "2_mug"),
+        ):
             with refuses(self, "Unknown object", ObjectError, known):
                 canonical_name(name, [known])
         with self.assertRaisesRegex(

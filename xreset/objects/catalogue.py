@@ -50,7 +50,7 @@ def mesh_files(folder: str | Path) -> dict[str, Path]:
 
 
 def canonical_name(name: str, known: Iterable[str] = STAND_INS) -> str:
-    """Return the name of a known object: from itself, its name without the number, or the paper's name for it.
+    """Return the name of a known object: from itself, its name with or without a number, or the paper's name for it.
 
     Raises:
         ObjectError: no known object has this name.
@@ -72,7 +72,10 @@ def canonical_names(names: Iterable[str], known: Iterable[str] = STAND_INS) -> t
         if not isinstance(name, str):
             raise ObjectError(f"Found {shown(name)}, expected the name of an object.")
         key = _key(name)
-        matches = [name] if name in known else [other for other in known if key in _keys(other)]
+        short = short_name(key, "_")
+        matches = [name]
+        if name not in known:
+            matches = [other for other in known if key in _keys(other) or _key(other) == short]
         if len(matches) == 1:
             found.append(matches[0])
         else:

@@ -13,12 +13,9 @@ What differs from PyBullet's defaults, and why:
 
 from __future__ import annotations
 
-import ctypes
-import os
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache, partial
 from importlib.metadata import version
@@ -57,6 +54,7 @@ from xreset.backends.rigid import (
 )
 from xreset.errors import BackendUnavailableError, XResetError
 from xreset.physics import Capability, unavailable
+from xreset.physics.plugins import silence
 from xreset.spec import GRAVITY, SceneSpec, Shape
 
 INTERNAL_STEPS = 2
@@ -119,7 +117,7 @@ class PybulletWorld(World):
             self._remove_defaults(self._object, link, group)
         self._set_collision_pairs()
 
-        with _silence():  # a warning for each joint whose axis is rounded
+        with silence():  # a warning for each joint whose axis is rounded
             self._drives = BulletDrives(p, self._robot, self._mechanism, dt)
         self._drives.scale(self._drive_scale)
         self._frames = TrackedFrames(self._mechanism)
@@ -469,31 +467,11 @@ def _wxyz(q: Sequence[float]) -> np.ndarray:
     return np.array((q[3], q[0], q[1], q[2]))
 
 
-@contextmanager
-def _silence() -> Iterator[None]:
-    """Drop what the engine prints in this block: it prints past Python, on the process's own streams."""
-    library = ctypes.CDLL(None)  # its buffer holds what C has printed
-    sys.stdout.flush()
-    sys.stderr.flush()
-    library.fflush(None)
-    kept = os.dup(1), os.dup(2)
-    with open(os.devnull, "w") as nowhere:
-        os.dup2(nowhere.fileno(), 1)
-        os.dup2(nowhere.fileno(), 2)
-    try:
-        yield
-    finally:
-        library.fflush(None)
-        for stream, copy in zip((1, 2), kept, strict=True):
-            os.dup2(copy, stream)
-            os.close(copy)
-
-
 @cache
 def _engine() -> Any:
     """Return the module ``pybullet``; ``BackendUnavailableError`` if it cannot be imported."""
     try:
-        with _silence():  # it prints its build time
+        with silence():  # it prints its build time
             import pybullet
     except ImportError as error:
         if sys.version_info[:2] > _NEWEST_PYTHON:

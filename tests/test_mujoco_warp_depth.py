@@ -1,5 +1,7 @@
 """Contacts of MuJoCo-Warp are as many and as deep as MuJoCo's where shapes are across an edge."""
 
+import subprocess
+import sys
 import warnings
 from unittest import TestCase
 from unittest.mock import patch
@@ -117,3 +119,10 @@ class OtherVersions(TestCase):
         self.assertEqual(wp.config.log_level, level)
         MujocoWarpBackend(scene(), 1).close()
         self.assertEqual(wp.config.log_level, level)
+
+
+class MessagesTest(TestCase):
+    def test_a_machine_without_a_gpu_is_not_warned_of_it(self):
+        code = "from xreset.physics.torch_warp import quiet\nwith quiet():\n    print('begun')"
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+        self.assertEqual((done.stdout, done.stderr), ("begun\n", ""))

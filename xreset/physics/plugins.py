@@ -7,11 +7,13 @@ and does not affect the others.
 
 from __future__ import annotations
 
+import ctypes
 import os
 import re
 import sys
 import traceback
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib.metadata import EntryPoint, entry_points
@@ -269,3 +271,23 @@ def backend_status(name: str) -> BackendStatus:
             name, None, "-", f"its engine_version() fails: {type(error).__name__}: {error}"
         )
     return BackendStatus(name, version, ", ".join(cls.devices()), None)
+
+
+@contextmanager
+def silence() -> Iterator[None]:
+    """Drop what an engine prints in this block: it prints past Python, on the process's own streams."""
+    library = ctypes.CDLL(None)  # its buffer holds what C has printed
+    sys.stdout.flush()
+    sys.stderr.flush()
+    library.fflush(None)
+    kept = os.dup(1), os.dup(2)
+    with open(os.devnull, "w") as nowhere:
+        os.dup2(nowhere.fileno(), 1)
+        os.dup2(nowhere.fileno(), 2)
+    try:
+        yield
+    finally:
+        library.fflush(None)
+        for stream, copy in zip((1, 2), kept, strict=True):
+            os.dup2(copy, stream)
+            os.close(copy)

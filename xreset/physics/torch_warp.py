@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from typing import Any
 
 import torch
 import warp as wp
 
+from xreset.physics.plugins import silence
+
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Hold back the line that Warp prints for each of some hundred kernels, in this block only."""
+    """Hold back the line that Warp prints for each of some hundred kernels, in this block only; and its warning that
+    there is no GPU."""
     level = wp.config.log_level
     wp.config.log_level = wp.LOG_WARNING
     try:
-        wp.init()
+        with nullcontext() if torch.cuda.is_available() else silence():
+            wp.init()
         yield
     finally:
         wp.config.log_level = level

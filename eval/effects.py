@@ -43,7 +43,7 @@ class Effect:
     difference: float
     difference_ci95: Interval
     demonstrations_suffice: bool
-    """Whether there are enough of them to tell a loss in all from chance, six or more."""
+    """Whether there are enough demonstrations, six or more, to tell a loss from chance."""
 
     def loses_more_than(self, most: float) -> bool:
         """Whether the loss is above a number, and that is not chance."""

@@ -270,8 +270,8 @@ class Evaluation(list[EvalResult]):
 
 
 def _turned_otherwise(one: Table, other: Table) -> bool:
-    """Whether an object's turn from its start to its goal is another one in two tables of as many episodes. Names of
-    demonstrations do not tell that: those of goal sets are alike. An earlier version did not measure turns."""
+    """Whether two tables of as many episodes differ in an object's turn from its start to its goal. The names in goal
+    sets do not show that, because they are alike. Turns that an earlier version did not measure count as equal."""
     turns = other["turn"].to_numpy(float) - one["turn"].to_numpy(float)
     return bool((np.abs(turns) > _SAME_TURN).any())
 

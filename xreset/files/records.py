@@ -202,10 +202,7 @@ def replaces(kind: str) -> Check:
         path = Path(path)
         if not path.is_file() or not path.stat().st_size or path.suffix.lower() == ".md":
             return
-        stated: Any = None
-        for schema_of_file in (npz_schema, lambda file: read_json(file).get("schema")):
-            with suppress(FileFormatError):
-                stated = schema_of_file(path)
+        stated = _kind_of(path)
         if not isinstance(stated, str) or not stated.startswith(kind):
             found = f"of another kind ({shown(stated)})" if stated else "not one of xreset's"
             raise XResetError(
@@ -214,6 +211,15 @@ def replaces(kind: str) -> Check:
             )
 
     return Check(refuse_other)
+
+
+def _kind_of(path: Path) -> Any:
+    """Return the schema that an npz or JSON file states; None if it states none."""
+    with suppress(FileFormatError):
+        return npz_schema(path)
+    with suppress(FileFormatError):
+        return read_json(path).get("schema")
+    return None
 
 
 @contextmanager

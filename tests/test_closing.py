@@ -16,7 +16,7 @@ from tests import toy_grasp
 from tests.command import succeeds
 from tests.data import InFolder
 from tests.engine_checks import with_drive
-from tests.toy_bank import in_this_process, toy_bank, toy_retargeted
+from tests.toy_bank import in_this_process, shifted, toy_bank, toy_retargeted
 from xreset import ClosingConfig, SqueezeConfig, read_bank
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.shapes import quat_of, turn_of
@@ -78,8 +78,10 @@ class ClosingTest(TestCase):
     def states(self, data=None, **config):
         fingers = toy_fingers(10, 2, gap=torch.as_tensor(self.gap))
         config = ClosingConfig(**({"spacing": 0.005} | config))
+        brick = toy_grasp.brick()
+        centered = shifted(brick, -brick.com)
         with patch("xreset.resets.closing.fingers_of", lambda *_: fingers):
-            return closing_states(data or self.data, ROBOT, (toy_grasp.brick(),), config)[:2]
+            return closing_states(data or self.data, ROBOT, (centered,), config)[:2]
 
     def bridged(self, data=None, **config):
         """Frames that states between follow."""

@@ -8,11 +8,10 @@ import numpy as np
 import torch
 from numpy.testing import assert_allclose
 
-from tests.toy_bank import ONLY_FRAMES, SOUP, SPAM, in_this_process, toy_retargeted
+from tests.toy_bank import ONLY_FRAMES, SOUP, SPAM, in_this_process, shifted, toy_retargeted
 from xreset import FilterConfig, SqueezeConfig, robots
 from xreset.errors import DemoError
 from xreset.geometry.kinematics import Kinematics
-from xreset.geometry.shapes import transform
 from xreset.objects.catalogue import load_objects
 from xreset.objects.rest import rest_height
 from xreset.physics import Health, State
@@ -35,9 +34,12 @@ class RejectionTest(TestCase):
         table = TableSpec()
         above = torch.tensor([[*table.center, 0.3]])
         still = State.at_rest(torch.zeros(1, 2), above, torch.tensor([[1.0, 0, 0, 0]]))
+        com = np.array([-0.2, 0, 0])  # from the mesh's origin, which a turn moves
+        turns = {"object_linvel": [0, 0.28, 0], "object_angvel": [0, 0, 1.4]}
         fast = {"object_linvel": [9.0, 0, 0], "joint_vel": [9.0, 0]}
         for expected, velocities, nonfinite, overflow in (
-            ("", {"object_linvel": [0, 0.06, -0.07], "object_angvel": [1, 1, 0.4]}, False, False),
+            ("", {"object_linvel": [0, 0.06, -0.07], "object_angvel": [1, 0, 0]}, False, False),
+            ("", turns, False, False),
             ("", {"joint_vel": [1.9, -1.9]}, False, False),
             ("object linear velocity", {"object_linvel": [0, 0.08, -0.07]}, False, False),
             ("object angular velocity", {"object_angvel": [1, -1, 0.6]}, False, False),
@@ -59,7 +61,7 @@ class RejectionTest(TestCase):
             backend = SimpleNamespace(
                 state=lambda state=state: state,
                 health=lambda health=health: health,
-                scene=SimpleNamespace(table=table, objects=[SimpleNamespace(com=np.zeros(3))]),
+                scene=SimpleNamespace(table=table, objects=[SimpleNamespace(com=com)]),
                 object_index=torch.tensor([0]),
                 num_worlds=1,
                 device="cpu",
@@ -93,13 +95,9 @@ class FilterTest(TestCase):
         soup = self.objects[0]
         for x, origin, expected in ((0.5, 2.0, []), (2.0, 0.5, ["out of bounds"])):
             shift = np.array([x - origin, 0.0, 0.0])
-            move = transform(np.eye(3), shift)
-            pieces = [replace(p, T_body_shape=move @ p.T_body_shape) for p in soup.pieces]
-            changes = {"com": soup.com + shift, "vertices": soup.vertices + shift}
-            moved = replace(soup, pieces=tuple(pieces), **changes)
             pos = np.array([[x, 0.3, self.height]]) - shift
             motion = toy_retargeted(self.robot, [SOUP], [0, 1], object_pos=pos)
-            bank = make_bank(motion, self.robot, [moved], **ONLY_FRAMES)
+            bank = make_bank(motion, self.robot, [shifted(soup, shift)], **ONLY_FRAMES)
             with self.subTest(x):
                 self.assertEqual(reasons(bank), expected)
 

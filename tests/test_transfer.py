@@ -14,7 +14,7 @@ from tests import toy_grasp
 from tests.command import succeeds
 from tests.data import InFolder
 from tests.test_closing import ROBOT
-from tests.toy_bank import in_this_process, toy_retargeted
+from tests.toy_bank import in_this_process, shifted, toy_retargeted
 from xreset import (
     SqueezeConfig,
     TransferConfig,
@@ -205,6 +205,18 @@ class TransferTest(TestCase):
         self.assertEqual(new.sequence_index.tolist(), [0, 0, 1, 1, 1])
         self.assertEqual(new.frame_index.tolist(), [1, 2, 1, 2, 3])
 
+    def test_the_origin_of_a_mesh_may_be_anywhere(self):
+        """This one goes down where the brick goes up and tilts."""
+        shift = np.array([0.9, 0, 0])
+        pos = self.data.object_pos - turn_of(self.data.object_quat_wxyz).apply(shift)
+        self.assertLess(pos[6, 2], pos[3, 2])
+        data = replace(self.data, object_pos=pos)
+        plain, _ = tried(self.bank, self.data)
+        with patch("tests.test_transfer.OBJECTS", [shifted(obj, shift) for obj in OBJECTS]):
+            found, _ = tried(bank(data, FIRMLY), data)
+        assert_array_equal(found.frame_index, plain.frame_index)
+        assert_allclose(found.joint_pos, plain.joint_pos, atol=1e-5)
+
     def test_starts_that_were_settled_change_nothing(self):
         settled = replace(self.bank, start_pos=self.bank.start_pos + np.float32([0, 0, 0.1]))
         found, plain = (tried(each, self.data)[0] for each in (settled, self.bank))
@@ -292,10 +304,14 @@ class HeldTest(TestCase):
         moved = [0.019, 0.021, 0.0, 0.0, 0.0, 0.0, np.nan]
         pos = torch.zeros(7, 3)
         pos[:, 2] = torch.tensor(moved)
-        start = State.at_rest(torch.zeros(7, 1), torch.zeros(7, 3), UPRIGHT.expand(7, 4))
+        com = np.array([0, 0.3, 0])  # from the mesh's origin, which a turn moves
+        first = torch.tensor([0, -0.3, 0]).expand(7, 3)
+        start = State.at_rest(torch.zeros(7, 1), first, UPRIGHT.expand(7, 4))
+        pos -= torch.as_tensor(turn_of(turned).apply(com)).float()
         state = replace(start, object_pos=pos, object_quat=torch.as_tensor(turned).float())
         world = torch.arange(7)
-        backend = Mock()
+        backend = Mock(object_index=torch.zeros(7, dtype=torch.long))
+        backend.scene.objects = [Mock(com=com)]
         backend.state.return_value = state
         backend.health.return_value = Health(nonfinite=world == 4, overflow=world == 5)
         self.assertEqual(_lost(backend, start).tolist(), [-1, 0, -1, 0, 0, 0, 0])

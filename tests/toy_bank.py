@@ -1,6 +1,7 @@
 """A small reset bank for tests, with soup and spam, three demonstrations and six states, all numbers distinct; and trajectories."""
 
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from typing import Any
 from unittest.mock import patch
@@ -8,6 +9,7 @@ from unittest.mock import patch
 import numpy as np
 
 from xreset import ResetBank, Retargeted, make_backend
+from xreset.geometry.shapes import transform
 
 SOUP = "005_tomato_soup_can"
 SPAM = "010_potted_meat_can"
@@ -24,6 +26,14 @@ def in_this_process():
         patch("xreset.env.manipulation.make_backend", here),
     ):
         yield
+
+
+def shifted(obj, shift):
+    """The object with a mesh that is shifted [3] in its frame."""
+    move = transform(np.eye(3), shift)
+    pieces = [replace(p, T_body_shape=move @ p.T_body_shape) for p in obj.pieces]
+    moved = {"com": obj.com + shift, "vertices": obj.vertices + shift}
+    return replace(obj, pieces=tuple(pieces), **moved)
 
 
 def toy_bank(robot, **changes):

@@ -89,10 +89,9 @@ def find_grasps(
     """
     names = [o.name for o in objects]
     rows = np.flatnonzero(motion.valid & motion.post_contact)
-    start_pos, start_quat = (values[motion.sequence_of_frame[rows]] for values in motion.start_pose)
-    moved = motion.object_pos[rows] - start_pos
+    moved = motion.shift(objects)[rows]
     if where == "table":
-        start = turn_of(start_quat)
+        start = turn_of(motion.start_pose[1][motion.sequence_of_frame[rows]])
         turned = (turn_of(motion.object_quat_wxyz[rows]) * start.inv()).magnitude()
         fits = (np.linalg.norm(moved, axis=1) < REST_DISTANCE) & (turned < REST_ANGLE)
     else:

@@ -33,6 +33,7 @@ from xreset.files.text import Brief, shown
 from xreset.geometry.shapes import quat_of, turn_of
 from xreset.objects.catalogue import canonical_names, load_object, object_names, official_name
 from xreset.objects.rest import rest_height
+from xreset.objects.sampling import centers_of_mass
 from xreset.objects.standins import STAND_INS
 from xreset.spec import ObjectSpec, objects_named
 
@@ -93,6 +94,14 @@ class ObjectMotions(Brief):
         """Object pose in each sequence's last frame, the goal of the task: [S, 3] and [S, 4]."""
         last = self.frame_offsets[1:] - 1
         return self.object_pos[last], self.object_quat_wxyz[last]
+
+    def shift(self, objects: Sequence[ObjectSpec]) -> np.ndarray:
+        """[F, 3] from each object's center of mass in its sequence's first frame to the present one [m]. Objects that
+        are not given have the shift of their origin, which depends on their mesh file."""
+        owner = self.sequence_of_frame
+        names = self.object_name[owner]
+        places = centers_of_mass(objects, names, self.object_pos, self.object_quat_wxyz)
+        return places - places[self.frame_offsets[:-1]][owner]
 
 
 @frozen

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from hashlib import blake2b
 from typing import Literal
 
 import numpy as np
 from scipy.spatial import ConvexHull
 
-from xreset.geometry.shapes import winding_number
+from xreset.geometry.shapes import turn_of, winding_number
 from xreset.spec import ObjectSpec
 
 Frame = Literal["mesh", "center"]
@@ -98,6 +99,16 @@ def center(obj: ObjectSpec) -> np.ndarray:
     corners = hull.points[hull.simplices] - inside
     volumes = np.abs(np.linalg.det(corners))
     return inside + volumes @ corners.sum(axis=1) / (4 * volumes.sum())
+
+
+def centers_of_mass(
+    objects: Iterable[ObjectSpec], names: np.ndarray, pos: np.ndarray, quat: np.ndarray
+) -> np.ndarray:
+    """[N, 3] centers of mass in the world [m] of objects with names [N] and poses [N, 3], [N, 4]; the origin where an
+    object is not given."""
+    known = {obj.name: obj.com for obj in objects}
+    coms = np.array([known.get(name, np.zeros(3)) for name in names.tolist()])
+    return pos + turn_of(quat).apply(coms.reshape(-1, 3))
 
 
 def keypoints(obj: ObjectSpec, frame: Frame = "mesh") -> np.ndarray:

@@ -24,7 +24,7 @@ TOUCH = 0.002
 WITHIN = 0.10
 """States are added between two frames if a finger is nearer than this to the object in one of them [m]."""
 MOVED = 0.01
-"""An object has been moved once its origin is farther than this from where it started [m]."""
+"""An object has been moved once its center of mass is farther than this from where it started [m]."""
 
 
 def closing_states(
@@ -46,7 +46,8 @@ def closing_states(
         object_name = retargeted.object_name[retargeted.sequence_of_frame]
         poses = (retargeted.joint_pos, retargeted.object_pos, retargeted.object_quat_wxyz)
         fingers = fingers_of(robot, objects, object_name, *poses)
-        followed = _frames_to_follow(retargeted, fingers)
+        shift = np.linalg.norm(retargeted.shift(objects), axis=-1)
+        followed = _frames_to_follow(retargeted, fingers, moved=shift > MOVED)
         step = retargeted.fingertip_pos[followed + 1] - retargeted.fingertip_pos[followed]
         travel = np.linalg.norm(step, axis=-1).max(axis=-1)
         count[followed] = np.maximum(np.ceil(travel / config.spacing).astype(int), 1)
@@ -59,12 +60,12 @@ def closing_states(
     return frame, part, (joint_pos, object_pos, object_quat)
 
 
-def _frames_to_follow(retargeted: Retargeted, fingers: Fingers) -> np.ndarray:
-    """Return the frames after which states are added, on the way to the next frame."""
+def _frames_to_follow(retargeted: Retargeted, fingers: Fingers, moved: np.ndarray) -> np.ndarray:
+    """Return the frames after which states are added, on the way to the next frame; ``moved`` [F]: whether the object
+    is away from where it started."""
     owner = retargeted.sequence_of_frame
     start = retargeted.frame_offsets[:-1][owner]
     grasped = fingers.grasp(TOUCH).numpy()
-    moved = np.linalg.norm(retargeted.object_pos - retargeted.object_pos[start], axis=-1) > MOVED
     ends = grasped | moved
     num_ends = np.cumsum(ends)
     before_sequence = (num_ends - ends)[start]

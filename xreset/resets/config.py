@@ -23,7 +23,7 @@ class FilterConfig(Checked):
     steps: PositiveInt = 8
     """Control steps of 1/60 s with the drives holding. The published paper has 48, and 240 for a parallel jaw."""
     linear_velocity: PositiveFloat = 0.10
-    """Largest speed of the object's origin [m/s]; published 0.5."""
+    """Largest speed of the object's center of mass [m/s]; published 0.5."""
     angular_velocity: PositiveFloat = 1.0
     """Largest angular speed of the object [rad/s]; published 15."""
     joint_velocity: PositiveFloat = 2.0

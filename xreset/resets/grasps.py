@@ -25,6 +25,7 @@ from xreset.geometry.rotations import (
     quat_to_matrix,
 )
 from xreset.geometry.surface import Surface, prepared_surface
+from xreset.objects.sampling import centers_of_mass
 from xreset.physics.tensors import Tensors, one_thread
 from xreset.resets.bank import ResetBank
 from xreset.retarget.arm.config import QUICK
@@ -94,19 +95,32 @@ class Grasps(Tensors):
     """Why there is no grasp, if there is none."""
 
 
-def carried(bank: ResetBank, robot: RobotSpec, start_height: np.ndarray) -> np.ndarray:
-    """[L] bool: whether a state's hand presses on an object in the air, for the objects' heights at the start of the
-    demonstrations [S] [m]."""
+def raised(
+    bank: ResetBank, objects: Sequence[ObjectSpec], start: tuple[np.ndarray, np.ndarray]
+) -> np.ndarray:
+    """[L] height of each state's center of mass above that of its demonstration's start pose [S, 3], [S, 4] [m]."""
+    names = bank.object_name
+    start_pos, start_quat = (values[bank.sequence_index] for values in start)
+    place = centers_of_mass(objects, names, bank.object_pos, bank.object_quat_wxyz)
+    return (place - centers_of_mass(objects, names, start_pos, start_quat))[:, 2]
+
+
+def carried(
+    bank: ResetBank,
+    robot: RobotSpec,
+    objects: Sequence[ObjectSpec],
+    start: tuple[np.ndarray, np.ndarray],
+) -> np.ndarray:
+    """[L] bool: whether a state's hand presses on an object in the air; ``start`` as in :func:`raised`."""
     hand = robot.hand_indices
     presses = (bank.targets[:, hand] != bank.joint_pos[:, hand]).any(axis=1)
-    raised = bank.object_pos[:, 2] - start_height[bank.sequence_index]
-    return presses & (raised > _CARRIED)
+    return presses & (raised(bank, objects, start) > _CARRIED)
 
 
-def grasps_of_bank(bank: ResetBank, robot: RobotSpec, name: str) -> Grasps:
+def grasps_of_bank(bank: ResetBank, robot: RobotSpec, obj: ObjectSpec) -> Grasps:
     """Return the grasps of an object in which a bank's hand presses on it in the air."""
-    is_carried = carried(bank, robot, bank.start_pos[:, 2])
-    rows = np.flatnonzero((bank.object_name == name) & bank.own_grasp & is_carried)
+    is_carried = carried(bank, robot, (obj,), (bank.start_pos, bank.start_quat_wxyz))
+    rows = np.flatnonzero((bank.object_name == obj.name) & bank.own_grasp & is_carried)
     model = ArmModel(robot)
     joints = torch.as_tensor(bank.joint_pos[rows], dtype=torch.float64)
     root = model.kinematics.link_poses(joints, [robot.hand_root])[:, 0]
@@ -310,7 +324,7 @@ def losses(
         if hand.is_jaw and len(hand.pad_balls):
             grasps = planned_grasps(hand, obj)
         else:
-            grasps = grasps_of_bank(bank, robot, obj.name)
+            grasps = grasps_of_bank(bank, robot, obj)
         for number in mine:
             start = _poses(bank.start_pos[[number]], bank.start_quat_wxyz[[number]])[0]
             goal = _poses(bank.goal_pos[[number]], bank.goal_quat_wxyz[[number]])[0]

@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 
 from xreset.files.progress import Progress, unseen
-from xreset.geometry.rotations import quat_rotate
 from xreset.physics import Backend, State
 from xreset.physics.plugins import device_for, make_backend
 from xreset.resets.config import FilterConfig
 from xreset.resets.schedule import schedule
 from xreset.spec import SceneSpec
+from xreset.task.reading import at_point
 from xreset.task.terminations import out_of_bounds
 
 Judge = Callable[[Backend, State], Tensor]
@@ -124,17 +124,20 @@ def rejections(
     return reason
 
 
+def of_center(backend: Backend, state: State) -> State:
+    """Return the states of an engine's worlds with each object's origin at its center of mass: the origin of its mesh
+    may be anywhere."""
+    coms = torch.as_tensor(np.stack([obj.com for obj in backend.scene.objects]))
+    return at_point(state, coms.to(state.object_pos)[backend.object_index])
+
+
 def rejection(backend: Backend, start: State, limits: FilterConfig) -> Tensor:
     """Return why the present states of an engine's worlds are rejected: [N] index into :data:`REASONS`, -1 where
     accepted."""
-    state = backend.state()
+    state = of_center(backend, backend.state())
     health = backend.health()
-    # the origin of a mesh may be anywhere
-    coms = torch.as_tensor(np.stack([obj.com for obj in backend.scene.objects]))
-    com = coms.to(state.object_pos)[backend.object_index]
-    place = state.object_pos + quat_rotate(state.object_quat, com)
     tests = (
-        out_of_bounds(place, backend.scene.table),
+        out_of_bounds(state.object_pos, backend.scene.table),
         state.object_linvel.norm(dim=-1) > limits.linear_velocity,
         state.object_angvel.norm(dim=-1) > limits.angular_velocity,
         state.joint_vel.abs().amax(dim=-1) > limits.joint_velocity,

@@ -27,7 +27,7 @@ from xreset.physics import Backend, State
 from xreset.resets.bank import ResetBank
 from xreset.resets.config import TransferConfig
 from xreset.resets.grasps import carried
-from xreset.resets.probe import rejections
+from xreset.resets.probe import of_center, rejections
 from xreset.retarget.arm.config import QUICK
 from xreset.retarget.arm.model import ArmModel, ArmTargets
 from xreset.retarget.arm.solve import track_each
@@ -89,11 +89,10 @@ def add_transfers(
         device: where engines run that can use it; the others run on the CPU.
         progress: called with what is done and what is to be done in all.
     """
-    start_pos, _ = retargeted.start_pose
-    grasps = np.flatnonzero(carried(bank, robot, start_pos[:, 2]))
+    grasps = np.flatnonzero(carried(bank, robot, objects, retargeted.start_pose))
     if not len(grasps):
         return bank
-    poses = _raised_frames(retargeted)
+    poses = _raised_frames(retargeted, objects)
     pose, grasp = _candidates(bank, grasps, retargeted.sequence_of_frame[poses])
     used = objects_named(objects, bank.object_name[grasp])
     scene = SceneSpec(robot=robot, objects=tuple(used.values()))
@@ -183,14 +182,14 @@ def _holding(
     return states[torch.as_tensor(held)], held, depth[held]
 
 
-def _raised_frames(retargeted: Retargeted) -> np.ndarray:
+def _raised_frames(retargeted: Retargeted, objects: Sequence[ObjectSpec]) -> np.ndarray:
     """[W] some frames of every demonstration, evenly spread over those in which the object is raised. The last one is
     the goal if the object is raised there."""
     chosen = []
-    start_pos, _ = retargeted.start_pose
-    for number, start in enumerate(start_pos):
+    is_raised = retargeted.shift(objects)[:, 2] > _RAISED
+    for number in range(len(retargeted.sequence_name)):
         frames = retargeted.frames(number)
-        raised = np.flatnonzero(retargeted.object_pos[frames, 2] - start[2] > _RAISED)
+        raised = np.flatnonzero(is_raised[frames])
         spread = np.linspace(0, len(raised) - 1, min(_POSES, len(raised)))
         chosen += (frames.start + raised[spread.astype(int)]).tolist()
     return np.array(chosen, dtype=int)
@@ -272,9 +271,9 @@ def _depth(scene: SceneSpec, object_name: np.ndarray, states: State) -> np.ndarr
 
 def _lost(backend: Backend, start: State) -> Tensor:
     """[N] -1 where the object of a world is where it was at the start, else 0."""
-    state = backend.state()
+    state = of_center(backend, backend.state())
     health = backend.health()
-    moved = (state.object_pos - start.object_pos).norm(dim=-1)
+    moved = (state.object_pos - of_center(backend, start).object_pos).norm(dim=-1)
     turned = quat_angle(state.object_quat, start.object_quat)
     held = (moved < _MOVED) & (turned < _TURNED) & ~health.nonfinite & ~health.overflow
     return torch.where(held, -1, 0)

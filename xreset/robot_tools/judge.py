@@ -37,7 +37,7 @@ from xreset.pictures.render import Camera, Renderer, add_caption
 from xreset.resets.bank import ResetBank
 from xreset.resets.config import SqueezeConfig
 from xreset.resets.fingers import Fingers, fingers_of, squeeze_targets
-from xreset.resets.grasps import losses
+from xreset.resets.grasps import losses, raised
 from xreset.resets.probe import probe
 from xreset.resets.programs import palm_path
 from xreset.spec import ObjectSpec, RobotSpec, SceneSpec, objects_named
@@ -219,7 +219,7 @@ def _grasps(
     squeeze: SqueezeConfig,
 ) -> tuple[ResetBank, State]:
     """Return the states to try, and how they start: at rest, with targets that press on the object."""
-    height = bank.object_pos[:, 2] - bank.start_pos[bank.sequence_index, 2]
+    height = raised(bank, objects, (bank.start_pos, bank.start_quat_wxyz))
     lifted = bank.with_states(np.flatnonzero(bank.own_grasp & bank.post_contact & (height > LIFT)))
     if not lifted.num_states:
         raise RobotError(

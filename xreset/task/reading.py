@@ -41,15 +41,6 @@ class Reading:
             center: [N, 3] origin of each world's object in the task, in its mesh frame [m]; None: the mesh's origin.
         """
         state = backend.state()
-        task_state = state
-        if center is not None:
-            offset = quat_rotate(state.object_quat, center)
-            spin = torch.linalg.cross(state.object_angvel, offset)
-            task_state = replace(
-                state,
-                object_pos=state.object_pos + offset,
-                object_linvel=state.object_linvel + spin,
-            )
         links = backend.links()
         health = backend.health()
         from_object = links.pos[:, 1:] - state.object_pos[:, None]
@@ -60,8 +51,19 @@ class Reading:
             contacts=backend.contacts(),
             health=replace(health, nonfinite=health.nonfinite | bad_action),
             tip_distance=torch.cdist(tips_in_mesh_frame, surface_points).amin(dim=-1),
-            task_state=task_state,
+            task_state=state if center is None else at_point(state, center),
         )
+
+
+def at_point(state: State, point: Tensor) -> State:
+    """Return a state in which the object's origin is the point [N, 3] of its mesh frame [m]."""
+    offset = quat_rotate(state.object_quat, point)
+    spin = torch.linalg.cross(state.object_angvel, offset)
+    return replace(
+        state,
+        object_pos=state.object_pos + offset,
+        object_linvel=state.object_linvel + spin,
+    )
 
 
 def step_log(

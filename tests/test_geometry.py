@@ -1,6 +1,7 @@
 """Surfaces, convex shapes, and the distances of a robot from itself and the table."""
 
 from unittest import TestCase
+from unittest.mock import patch
 
 import numpy as np
 import torch
@@ -51,6 +52,21 @@ class SurfaceTest(TestCase):
         assert_allclose(distance[near], self.exact[near], atol=2.1e-3)
         assert_allclose(distance, self.exact, atol=4e-3)
         self.assertLess(np.abs(distance - self.exact).mean(), 4e-4)
+
+    def test_the_grid_of_a_large_object_is_coarse(self):
+        size = (0.6, 0.8, 1.0)
+        with patch("xreset.geometry.surface._MOST_CELLS", 3e4):
+            large = Surface(box_object(((0, 0, 0), size))).field
+        self.assertLess(len(large.values), 4e4)
+        both = DistanceFields.join([self.surface.field, large])
+        points = np.concatenate((self.points, 10 * self.points))
+        which = torch.arange(2).repeat_interleave(500)
+        found, slope = both.signed_distance(torch.as_tensor(points), which)
+        assert_array_equal(found[:500], distances(self.surface.field, self.points))
+        exact = signed_distance(box((0, 0, 0), size), points[500:])
+        near = exact < 0.03
+        assert_allclose(found[500:][near], exact[near], atol=large.spacing.item() / 2)
+        self.assertAlmostEqual(slope[500:].norm(dim=-1).median().item(), 1.0, places=3)
 
     def test_nearest_point_is_exact(self):
         nearest, distance = self.surface.nearest(self.points)

@@ -32,8 +32,8 @@ class DistanceFields(Tensors):
     """[M, 3] lower corner of the object's bounding box."""
     high: Tensor
     """[M, 3] upper corner of the object's bounding box."""
-    spacing: float
-    """Distance of neighboring nodes [m]."""
+    spacing: Tensor
+    """[M] distance of neighboring nodes [m]."""
 
     @staticmethod
     def on_grid(
@@ -51,12 +51,12 @@ class DistanceFields(Tensors):
             origin=torch.as_tensor(origin)[None],
             low=torch.as_tensor(low)[None],
             high=torch.as_tensor(high)[None],
-            spacing=spacing,
+            spacing=torch.tensor([spacing], dtype=torch.float64),
         )
 
     @staticmethod
     def join(parts: Sequence[DistanceFields]) -> DistanceFields:
-        """Join the fields of several objects; all must have the same spacing and device."""
+        """Join the fields of several objects, which must be on the same device."""
         start = []
         nodes = 0
         for part in parts:
@@ -81,7 +81,8 @@ class DistanceFields(Tensors):
             Indices [A] of the near points, their signed distances [A] and gradients [A, 3].
         """
         in_box = points.clamp(self.low[object_index], self.high[object_index])
-        reachable = (points - in_box).norm(dim=-1) <= (limit + self.spacing).clamp_min(0.0)
+        reach = (limit + self.spacing[object_index]).clamp_min(0.0)
+        reachable = (points - in_box).norm(dim=-1) <= reach
         candidates = reachable.nonzero()[:, 0]
         distance, gradient = self.signed_distance(points[candidates], object_index[candidates])
         near = distance < limit[candidates]
@@ -97,7 +98,8 @@ class DistanceFields(Tensors):
             object_index: [N] index of the object.
         """
         counts = self.counts[object_index]
-        unclamped = (points - self.origin[object_index]) / self.spacing
+        spacing = self.spacing[object_index]
+        unclamped = (points - self.origin[object_index]) / spacing[:, None]
         x = torch.minimum(unclamped.clamp_min(0.0), counts - 1.0001)
         beyond = unclamped - x
         excess = beyond.norm(dim=-1)
@@ -119,5 +121,5 @@ class DistanceFields(Tensors):
         slope_xy = slope_xy[..., 0] + fz[:, None] * (slope_xy[..., 1] - slope_xy[..., 0])
         gradient = torch.cat((slope_xy, slope_z[:, None]), dim=1)
         outward = beyond / excess[:, None].clamp_min(1e-12)
-        gradient = torch.where(beyond == 0, gradient / self.spacing, outward)
-        return along_y[:, 0] + fz * slope_z + excess * self.spacing, gradient
+        gradient = torch.where(beyond == 0, gradient / spacing[:, None], outward)
+        return along_y[:, 0] + fz * slope_z + excess * spacing, gradient

@@ -21,11 +21,13 @@ if TYPE_CHECKING:
     from xreset.geometry.fields import DistanceFields
 
 _SAMPLE_SPACING = 0.003
-"""Typical distance of the samples that narrow the search for the nearest triangle [m]."""
+"""Typical distance of the samples that narrow the search for the nearest triangle of a usual object [m]."""
 _CANDIDATES = 6
 """Number of triangles that are searched for the nearest point."""
 _GRID_SPACING = 0.004
-"""Spacing of the grid of signed distances [m]."""
+"""Spacing of the grid of signed distances of a usual object [m]."""
+_MOST_CELLS = 1e6
+"""Cells of the largest usual object, a cube of 34 cm. The grid and the samples of a larger one are coarser."""
 _GRID_MARGIN = 0.032
 """Width of the grid around the object's bounding box [m]."""
 _NODES_AT_ONCE = 100_000
@@ -56,21 +58,25 @@ class Surface:
         self.high = corners.max(axis=0)
         """[3] upper corner of the bounding box."""
         origin = self.low - _GRID_MARGIN
-        counts = np.ceil((self.high - self.low + 2 * _GRID_MARGIN) / _GRID_SPACING).astype(int) + 1
-        nodes = origin + _GRID_SPACING * np.moveaxis(np.indices(tuple(counts)), 0, -1)
+        size = self.high - self.low + 2 * _GRID_MARGIN
+        scale = max(1.0, float(np.prod(size / _GRID_SPACING) / _MOST_CELLS) ** (1 / 3))
+        spacing = scale * _GRID_SPACING
+        sample_spacing = scale * _SAMPLE_SPACING
+        counts = np.ceil(size / spacing).astype(int) + 1
+        nodes = origin + spacing * np.moveaxis(np.indices(tuple(counts)), 0, -1)
         inside = _nodes_inside(obj.pieces, nodes)
 
-        count = int(np.clip(mesh.area / _SAMPLE_SPACING**2, 2_000, 40_000))
+        count = int(np.clip(mesh.area / sample_spacing**2, 2_000, 40_000 * scale**2))
         points, owners = trimesh.sample.sample_surface(mesh, count, seed=0)[:2]
         # The centers of the triangles give even the smallest triangle a sample.
         points = np.concatenate((points, self._triangles.mean(axis=1)))
         owners = np.concatenate((owners, np.arange(len(self._triangles))))
 
         def is_inside(at: np.ndarray) -> np.ndarray:
-            index = np.rint((at - origin) / _GRID_SPACING).astype(int).clip(0, counts - 1)
+            index = np.rint((at - origin) / spacing).astype(int).clip(0, counts - 1)
             return inside[tuple(index.T)]
 
-        outward = _GRID_SPACING * np.asarray(mesh.face_normals)[owners]
+        outward = spacing * np.asarray(mesh.face_normals)[owners]
         # not where pieces overlap
         exposed = ~(is_inside(points + outward) & is_inside(points - outward))
         self._owners = owners[exposed]
@@ -79,9 +85,10 @@ class Surface:
         flat_nodes = nodes.reshape(-1, 3)
         distance, _ = self._tree.query(flat_nodes, workers=-1)  # on all cores
         # farther nodes keep the distance to the nearest sample
-        near = distance < 2 * _GRID_SPACING + _SAMPLE_SPACING
+        near = distance < 2 * spacing + sample_spacing
         _, distance[near] = self.nearest(flat_nodes[near])
         self._origin = origin
+        self._spacing = spacing
         self._signed = np.where(inside.reshape(-1), -distance, distance).reshape(counts)
 
     @cached_property
@@ -90,7 +97,7 @@ class Surface:
         from xreset.geometry.fields import DistanceFields
 
         return DistanceFields.on_grid(
-            self._signed, self._origin, _GRID_SPACING, self.low, self.high
+            self._signed, self._origin, self._spacing, self.low, self.high
         )
 
     def samples(self, count: int) -> np.ndarray:
@@ -103,9 +110,9 @@ class Surface:
 
         Beyond the grid, the distance to the grid is added.
         """
-        nodes = (points.reshape(-1, 3) - self._origin) / _GRID_SPACING
+        nodes = (points.reshape(-1, 3) - self._origin) / self._spacing
         nearest = nodes.clip(0, np.array(self._signed.shape) - 1)
-        beyond = _GRID_SPACING * np.linalg.norm(nodes - nearest, axis=-1)
+        beyond = self._spacing * np.linalg.norm(nodes - nearest, axis=-1)
         distance = map_coordinates(self._signed, nearest.T, order=1) + beyond
         return distance.reshape(points.shape[:-1])
 

@@ -178,7 +178,7 @@ def _in_each_other(
     )
     reach = balls.half_sizes.norm(dim=-1)
     apart = (middles[:, a] - middles[:, b]).norm(dim=-1)
-    near = apart < reach[a] + reach[b] + max(margin, 0.0) + balls.fields.spacing
+    near = apart < reach[a] + reach[b] + max(margin, 0.0) + balls.fields.spacing[b]
     frame, pair = (near & considered[:, None]).nonzero(as_tuple=True)
     # The guards of the first link of a pair are looked at in the frame of the second.
     first = model.group_body[a]
@@ -235,7 +235,7 @@ def _boxes_meet(
         index: [K] the field.
         margin: distance [m].
     """
-    half = model.balls.half_sizes[link] + max(margin, 0.0) + fields.spacing
+    half = model.balls.half_sizes[link] + max(margin, 0.0) + fields.spacing[index][:, None]
     low = fields.low[index]
     high = fields.high[index]
     field_half = (high - low) / 2

@@ -207,7 +207,7 @@ def stress(
 @obeys_rules
 def make_report(
     runs: str | Path | Sequence[str | Path],
-    out: Output | None = None,
+    out: Annotated[Output, replaces("xreset-report", "index.html")] | None = None,
     *,
     robot: str | Path | None = None,
     meshes: str | Path | None = None,

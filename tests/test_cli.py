@@ -510,6 +510,12 @@ class OutputTest(InFolder):
         np.savez(mine, my_own=1)
         text = self.folder / "package.json"
         text.write_text('{"name": "mine"}')
+        site = self.folder / "site"
+        site.mkdir()
+        page = site / "index.html"
+        page.write_text("<title>My own</title>")
+        readme = self.folder / "README.md"
+        readme.write_text("# My own")
         another = r"of another kind \('xreset-{}/1'\)\. Nothing was overwritten; choose"
         own = "not one of xreset's"
         for command, out, words in (
@@ -522,6 +528,7 @@ class OutputTest(InFolder):
             ("resets none.npz", motion, another.format("retargeted")),
             ("goals soup --robot openarm", demos, another.format("demos")),
             ("engines check", text, own),
+            ("engines check", readme, own),
             ("engines compare none.npz", text, own),
             ("export episodes none", demos, another.format("demos")),
         ):
@@ -530,6 +537,8 @@ class OutputTest(InFolder):
                 flag = "" if command.endswith("--rest") else "--out"
                 self.assertRegex(refused(command, flag, out), words)
                 self.assertEqual(out.read_bytes(), before)
+        self.assertRegex(refused("report none --out", site), own)
+        self.assertEqual(page.read_text(), "<title>My own</title>")
         empty = self.folder / "empty.npz"
         empty.touch()
         for out in (empty, empty, demos):  # of its own kind

@@ -7,6 +7,7 @@ from typing import Any
 from unittest import TestCase
 
 from xreset.eval.engines.page import page
+from xreset.files.records import _kind_of
 
 STORED = Path(__file__).with_name("engines")
 CONFORMANCE: dict[str, Any] = json.loads((STORED / "conformance.json").read_text())
@@ -25,7 +26,9 @@ class PageTest(TestCase):
         return [cell.strip() for cell in line.strip("|").split(" | ")]
 
     def test_it_is_the_stored_page(self):
-        self.assertEqual(page(CONFORMANCE), (STORED / "page.md").read_text())
+        stored = STORED / "page.md"
+        self.assertEqual(page(CONFORMANCE), stored.read_text())
+        self.assertEqual(_kind_of(stored), "xreset-engines")  # so that another one replaces it
 
     def test_each_engine_is_a_column(self):
         slower = self.changed(engine="mujoco-warp", device="cuda", capabilities=["friction"])

@@ -191,16 +191,25 @@ def npz_schema(path: str | Path, *, what: str = "one of xreset's npz files") -> 
     return stated
 
 
-def replaces(kind: str) -> Check:
+_PAGES = {
+    b"# Engines: what each can do, and how far they agree": "xreset-engines",
+    b" - xreset report</title>": "xreset-report",
+}
+"""Text that every page of a kind has near its beginning -> the kind."""
+
+
+def replaces(kind: str, name: str = "") -> Check:
     """Return the check of an output file that refuses to replace a file of another kind.
 
     Args:
-        kind: beginning of the schema that the output states. A file without content, and a page (.md), may be replaced.
+        kind: beginning of the schema that the output states, or of a page's kind. A file without content may be
+            replaced.
+        name: of the file, where the output is a folder.
     """
 
     def refuse_other(path: str | Path) -> None:
-        path = Path(path)
-        if not path.is_file() or not path.stat().st_size or path.suffix.lower() == ".md":
+        path = Path(path, name)
+        if not path.is_file() or not path.stat().st_size:
             return
         stated = _kind_of(path)
         if not isinstance(stated, str) or not stated.startswith(kind):
@@ -214,12 +223,14 @@ def replaces(kind: str) -> Check:
 
 
 def _kind_of(path: Path) -> Any:
-    """Return the schema that an npz or JSON file states; None if it states none."""
+    """Return the schema that an npz or JSON file states, or the kind of a page; None if it is neither."""
     with suppress(FileFormatError):
         return npz_schema(path)
     with suppress(FileFormatError):
         return read_json(path).get("schema")
-    return None
+    with path.open("rb") as file:
+        beginning = file.read(10_000)
+    return next((kind for text, kind in _PAGES.items() if text in beginning), None)
 
 
 @contextmanager

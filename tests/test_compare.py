@@ -36,6 +36,7 @@ from xreset.eval.stats import (
     holm,
 )
 from xreset.learning.clock import Lift, Passing, write_lift
+from xreset.learning.run import TEACHER, RobotData
 from xreset.task.config import ResetConfig, TaskConfig, TerminationConfig
 
 STEPS = 1024
@@ -279,6 +280,16 @@ class GroupTest(Compared):
         self.write_results("ik")
         found = self.groups(seeds[0], other, seeds[1], bank, seeds[2], "ik")
         self.assertEqual(found, ([("soup", 3), ("fixed", 1), ("bank", 1), ("ik", 1)], ""))
+
+    def test_trainings_with_another_teacher_or_second_bank_are_no_group(self):
+        for i in range(3):
+            self.run_and_results(f"student-{i}", seed=i, teacher="a/t.onnx")
+            (self.folder / f"student-{i}" / TEACHER).write_text("b" if i == 2 else "a")
+            second = RobotData(robot="b", resets="b.npz", resets_hash=f"{i // 2}", meshes=None)
+            self.run_and_results(f"two-{i}", seed=i, others=(second,))
+        for name in ("student", "two"):
+            found = self.groups(*(f"{name}-{i}" for i in range(3)))
+            self.assertEqual(found, ([(name, 2), (f"{name}-2", 1)], ""))
 
     def test_names_of_groups(self):
         for names, expected in (

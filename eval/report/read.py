@@ -25,12 +25,12 @@ from xreset.eval.results import (
 )
 from xreset.eval.stats import Table
 from xreset.files.checks import frozen, renamed
-from xreset.files.storage import read_json
+from xreset.files.storage import file_hash, read_json
 from xreset.files.text import Brief, short_name, shown
 from xreset.geometry.description import load_robot
 from xreset.learning.clock import Lift, read_lift
 from xreset.learning.run import SCHEMA as RUN_SCHEMA
-from xreset.learning.run import RunInfo, flat, read_run
+from xreset.learning.run import TEACHER, RunInfo, flat, read_run
 from xreset.policy.shipped import run_folder
 from xreset.spec import RobotSpec
 
@@ -382,15 +382,23 @@ def run_facts(run: dict[str, Any], file: Path) -> dict[str, str]:
             f"{file} lacks {', '.join(wrong)}, or holds it as another type. Train again, or leave this run out."
         )
     robots = [f"{run['robot']} ({str(contract.get('robot_fingerprint'))[:8]})"]
+    banks = [_file_fact(run["resets"], run["resets_hash"])]
     others = run.get("others")
-    if isinstance(others, list):
-        robots += [str(each.get("robot")) for each in others if isinstance(each, dict)]
+    for each in others if isinstance(others, list) else ():
+        if isinstance(each, dict):
+            robots.append(str(each.get("robot")))
+            banks.append(_file_fact(str(each.get("resets")), str(each.get("resets_hash"))))
+    teacher = "-"
+    if run.get("teacher") is not None:
+        copy = file.parent / TEACHER
+        teacher = _file_fact(str(run["teacher"]), file_hash(copy) if copy.is_file() else "?")
     return {
         "robot": ", ".join(robots),
         "objects": ", ".join(map(short_name, names or ())) or "-",
         "meshes": "stand-ins" if run.get("meshes") is None else "meshes",
-        "bank": f"{Path(run['resets']).name} ({run['resets_hash'][:8]})",
+        "bank": ", ".join(banks),
         "weights": str(run.get("weights") or "new"),
+        "teacher": teacher,
         "engine": f"{run.get('engine')} {run.get('engine_version')}",
         "device": run["device"].partition(":")[0],
         "num_envs": str(run.get("num_envs")),
@@ -398,3 +406,7 @@ def run_facts(run: dict[str, Any], file: Path) -> dict[str, str]:
         "xreset": str(run.get("xreset")).partition("+")[0],
         **{name: f"{x:.6g}" if isinstance(x, float) else str(x) for name, x in flat(run["config"])},
     }
+
+
+def _file_fact(path: str, hash_: str) -> str:
+    return f"{Path(path).name} ({hash_[:8]})"

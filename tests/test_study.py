@@ -27,7 +27,7 @@ from xreset.eval.study.steps import XRESET, Step, flags
 from xreset.eval.study.tables import fill
 from xreset.learning import verbs
 from xreset.learning.config import TrainConfig
-from xreset.learning.run import checkpoints, latest_checkpoint
+from xreset.learning.run import checkpoints, latest_checkpoint, read_run
 
 HEAD = 'schema = "xreset-study/1"\nabout = "A test."\n'
 DATA = "[data.toy]\nsynthetic_per_object = 1\n"
@@ -349,7 +349,7 @@ class TablesTest(Studied):
         self.assertIn("Runs side by side", text)
         for note in (
             "The training ours-seed0 is not finished: not begun",
-            "Not evaluated yet: eval x-sim-seed0, eval x-sim-seed1",
+            "Not evaluated yet: eval ours-seed0, eval ours-seed1, eval x-sim-seed0, eval x-sim-seed1",
             "10,000 iterations",
         ):
             self.assertTrue(any(note in n for n in notes), note)
@@ -407,6 +407,16 @@ class TablesTest(Studied):
         self.assertEqual(fill(plan, plan.study.tables[1]).engines, {})
         report = write_page(plan, self.folder / "page")
         self.assertIn("nothing is evaluated yet", report.page.read_text())
+
+    def test_seeds_that_were_evaluated_differently_have_no_mean(self):
+        self.write("ours-seed0", 1.0, 1.0, 0.33, 0.33)
+        plan = self.plan(self.TEXT)
+        for *progress, inputs in ((0.6, 0.6, 0.6, {}), (0.6, 0.6, 0.6, 0.6, {"demos": "other"})):
+            self.write("ours-seed1", *progress, **({"inputs": inputs} if inputs else {}))
+            rows = fill(plan, plan.study.tables[0]).engines["mujoco"]
+            self.assertTrue(all(row[-1].startswith("-") for row in rows[1:]), rows)
+            notes = write_page(plan, self.folder / "page").notes
+            self.assertTrue(any("These results are not comparable" in n for n in notes), notes)
 
     def test_results_of_other_episodes_do_not_count(self):
         self.write("ik", 0.33, 0.33, 0.33, 0.33)
@@ -484,6 +494,8 @@ class WholeTest(InOneFolder):
             command[len(XRESET) :],
             ["train", "--out", f"{self.out}/x-reset-seed0", "--iterations", "4"],
         )
+        left = plan.steps["eval x-reset-seed0"].left()
+        self.assertEqual(left, "in mujoco", "the policy will be another one")
 
     def test_another_configuration_under_the_same_name_is_refused(self):
         before = latest_checkpoint(self.out / "x-reset-seed0").read_bytes()
@@ -501,6 +513,12 @@ class WholeTest(InOneFolder):
             with refuses(self, message, RunError):
                 self.plan(change)
         self.assertEqual(latest_checkpoint(self.out / "x-reset-seed0").read_bytes(), before)
+        run = self.plan().runs[0]
+        begun = replace(read_run(run.folder), weights="runs/a-seed0/checkpoints/000002.pt")
+        with patch("xreset.eval.study.steps.read_run", return_value=begun):
+            replace(run, weights=self.out / "a-seed0").check()
+            with refuses(self, "networks of is 'a-seed0' there and 'b-seed0' in", RunError):
+                replace(run, weights=self.out / "b-seed0").check()
 
     def test_other_meshes_are_refused_also_before_their_bank_is_made(self):
         other = ("[data.", "[data.meshes]\nsynthetic_per_object = 1\nmeshes = 'meshes'\n\n[data.")

@@ -164,8 +164,9 @@ class Run:
             wanted[name] = getattr(self.spec, name)
         found["stand-ins"] = info.meshes is None
         wanted["stand-ins"] = self.subset.meshes is None
-        found["other networks to begin with"] = info.weights is not None
-        wanted["other networks to begin with"] = self.weights is not None
+        # RUN/checkpoints/NUMBER.pt
+        found["networks of"] = info.weights and Path(info.weights).parent.parent.name
+        wanted["networks of"] = self.weights and self.weights.name
         if self.bank.is_file():
             found["reset bank"] = info.resets_hash[:12]
             wanted["reset bank"] = file_hash(self.bank)[:12]
@@ -240,7 +241,8 @@ def train_todo(run: Run) -> Todo:
 
 
 def eval_todo(run: Run, folder: Path, spec: Evaluation, subset: Subset, engines: list[str]) -> Todo:
-    """Return the engines in which an evaluation has no result, or a result of other episodes or files."""
+    """Return the engines in which an evaluation has no result, or a result of other episodes or files. Results of a
+    policy whose training goes on are of another file, too."""
     policy = run.spec.policy
     files = {"demos": subset.demos}
     demos = subset.demos
@@ -270,6 +272,8 @@ def eval_todo(run: Run, folder: Path, spec: Evaluation, subset: Subset, engines:
         seconds=spec.episode_seconds,
         trained=trained,
     )
+    if policy is None and train_todo(run)[0]:
+        missing = engines
     command += [f"--engine={engine}" for engine in missing]
     return (f"in {', '.join(missing)}", [command]) if missing else ("", [])
 

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import chain
 from typing import Literal
 
 import pandas as pd
 
 from xreset.eval.metrics import METRICS
+from xreset.eval.report.fairness import uneven
 from xreset.eval.report.groups import COUNTED, counted, estimate
 from xreset.eval.report.read import Training, read_training
 from xreset.eval.results import has_results
@@ -134,12 +137,27 @@ def trainings_of(plan: Plan, group: str, evaluation: str) -> list[Training]:
 
 
 def _episodes(trainings: Sequence[Training], alone: bool) -> Table:
-    """Join the episodes of trainings. If each object was trained alone, demonstrations get new numbers over all
-    objects."""
+    """Join the episodes of trainings, without those in an engine in which the trainings were evaluated differently: a
+    study that has changed may have evaluated some of them again. If each object was trained alone, demonstrations get
+    new numbers over all objects."""
     every: Table = pd.concat([pd.DataFrame(), *(t.episodes for t in trainings)], ignore_index=True)
-    if alone and len(every):
+    if not len(every):
+        return every
+    if alone:
         every["sequence"] = every.groupby(["object", "sequence_name"]).ngroup()
-    return every
+    engines = every["engine"].unique()
+    return every[every["engine"].isin([e for e in engines if _is_even(trainings, alone, e)])]
+
+
+def _is_even(trainings: Sequence[Training], alone: bool, engine: str) -> bool:
+    """Whether the trainings were evaluated alike in an engine; those of each object if it was trained alone."""
+    compared = defaultdict(list)
+    for training in trainings:
+        if engine in training.results:
+            objects = frozenset(training.episodes["object"]) if alone else None
+            results = {engine: training.results[engine]}
+            compared[objects].append(replace(training, results=results))
+    return not any(map(uneven, compared.values()))
 
 
 def _episodes_with(episodes: Table, engine: str, objects: set[str]) -> Table:

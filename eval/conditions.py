@@ -72,7 +72,8 @@ class Property:
         return f"x {number}" if self.unit == "x" else f"{number} {self.unit}".rstrip()
 
     def at(self, value: float, task: TaskConfig) -> Condition:
-        """Return the condition that the property has a value and everything else is as in a task.
+        """Return the condition that the property has a value and everything else is as in a task. Images are late by
+        whole control steps, so the nearest of them is the value of their latency.
 
         Raises:
             XResetError: the property cannot have the value.
@@ -83,6 +84,9 @@ class Property:
                 faults = self._faults(value)
             else:
                 drawn = value / task.control_dt if self.in_steps else value
+                if self.in_steps and self.of_cameras:
+                    drawn = max(1.0, float(round(drawn)))
+                    value = round(drawn * task.control_dt, 3)
                 changed = replace(task.randomization, **{self.changed_field: (drawn, drawn)})
                 task = replace(task, randomization=changed)
         except ValueError as error:

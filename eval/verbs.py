@@ -190,7 +190,8 @@ def stress(
     task = nominal_task(trial.task)
     conditions = [Condition(task=task)]
     for prop in wanted:
-        conditions += [prop.at(value, task) for value in prop.values]
+        tried = [prop.at(value, task) for value in prop.values]
+        conditions += {condition.value: condition for condition in tried}.values()
     default = spec.folder.parent / ("faults" if on_robot else "stress")
     return experiment.play(
         spec,

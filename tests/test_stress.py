@@ -47,6 +47,14 @@ class StressedTest(TestCase):
             )
             self.assertEqual(found.reset, task.reset)
 
+    def test_images_are_late_by_whole_control_steps(self):
+        (late,) = chosen_properties(["camera-latency=0.001,0.05,0.06"])
+        task = replace(nominal_task(TaskConfig()), substeps=8)  # 30 control steps a second
+        tried = [late.at(value, task) for value in late.values]
+        self.assertEqual([condition.value for condition in tried], [0.033, 0.067, 0.067])
+        drawn = [condition.task.randomization.camera_latency[0] for condition in tried]
+        self.assertEqual(drawn, [1.0, 2.0, 2.0])
+
     def test_values_of_ones_own(self):
         (prop,) = chosen_properties(["arm-stiffness=2,0.5,1"])
         self.assertEqual((prop.option, prop.values), ("arm-stiffness", (0.5, 2.0)))

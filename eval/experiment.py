@@ -148,6 +148,7 @@ def _play_in(
         unseen=policy.unseen(trial.names),
         vision=vision if vision.cameras else None,
         episode_seconds=_length(trial),
+        object_frame=trial.task.object_frame,
         left_out=dict.fromkeys(skipped, f"{engine.name} cannot set it"),
         stopped=dict(stopped),
         episodes=pd.concat(tables, ignore_index=True),

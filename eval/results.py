@@ -12,7 +12,7 @@ from dataclasses import MISSING, asdict, field, fields, make_dataclass
 from functools import cache, cached_property
 from itertools import chain
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, get_type_hints
+from typing import Annotated, Any, ClassVar, Literal, get_type_hints
 
 import numpy as np
 import pandas as pd
@@ -167,6 +167,8 @@ class EvalResult(Brief, Checked):
     """Cameras of the policy. None: it has none, or an earlier version did not state them."""
     episode_seconds: PositiveFloat | None = None
     """Length of an episode [s]. None: an earlier version did not state it; it was that of the policy's training."""
+    object_frame: Literal["mesh", "center"] | None = None
+    """What objects are turned about at the start, and measured at. None: an earlier version did not state it."""
     left_out: dict[str, str] = field(default_factory=dict)
     """Property that was not changed -> reason."""
     stopped: dict[str, int] = field(default_factory=dict)

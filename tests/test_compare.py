@@ -559,6 +559,13 @@ class FairnessTest(Compared):
         self.write_results("usual", engines=("sapien",), episode_seconds=12.0)
         self.assertRegex(self.compare("usual"), r"\(5: usual in mujoco; 12: usual in sapien\)")
 
+    def test_policies_without_a_run_that_start_otherwise(self):
+        for name, frame in (("old", None), ("by-mesh", "mesh"), ("by-center", "center")):
+            self.write_results(name, object_frame=frame)
+        self.assertNotIn("not comparable", self.compare("old", "by-mesh"))
+        words = r"not the same task.object_frame \(mesh: by-mesh; center: by-center\)"
+        self.assertRegex(self.compare("by-mesh", "by-center"), words)
+
     def test_results_of_a_policy_from_before_a_run_went_on(self):
         policy = "f2ca1bb6c7e907d06dafe4687e579fce76b37e4e93b7605022da52e6ccc26fd2"  # of "test\n"
         self.run_and_results("a", {"inputs": {"demos": "ab", "policy": policy}})

@@ -153,6 +153,8 @@ def _condition_table(trainings: Sequence[Training]) -> Table:
             row |= _played_task(training)
             if result.episode_seconds is not None:  # may differ from the training's
                 row[_LENGTH] = f"{result.episode_seconds:.6g}"
+            if result.object_frame is not None:  # a policy that ships has no training here
+                row["task.object_frame"] = result.object_frame
             rows.append(row)
     return pd.DataFrame(rows)
 

@@ -116,6 +116,13 @@ class Wrong(InFolder):
         found = examine(demos, surfaces_of(demos, meshes), camera=file.camera)
         return " ".join(map(str, found))
 
+    def test_a_rate_that_is_wrong_by_a_factor_of_two(self):
+        demos = read_demos(data_dir() / "dexycb_left_9x10.npz")
+        for factor, least in ((0.5, 36), (2.0, 40)):
+            found = examine(replace(demos, fps=factor * demos.fps))
+            (speed,) = [each for each in found if each.name == "speed"]
+            self.assertGreater(len(speed.sequences), least)
+
     def test_hardly_any_kind_of_error_passes_in_silence(self):
         """A mesh whose origin is off along a bottle that lies down still fits the hand."""
         meshes = data_dir() / "ycb20"

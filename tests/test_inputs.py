@@ -31,6 +31,7 @@ from xreset import (
 from xreset.errors import DemoError, FileFormatError, RobotError, XResetError
 from xreset.eval.rollout import load_trial
 from xreset.files.storage import file_hash
+from xreset.objects.catalogue import object_source
 from xreset.resets.bank import check_objects, starts_and_goals
 from xreset.resets.config import GoalConfig
 from xreset.resets.inputs import load_inputs
@@ -149,9 +150,27 @@ class InputsTest(InOneFolder):
             load_inputs(other)
         changed = (replace(load_object(SOUP), source="def"), load_object(SPAM))
         with self.assertRaisesRegex(
-            FileFormatError, "an imported mesh of .*, but the given one is another mesh. Give the"
+            FileFormatError, "an imported mesh of .*, but the given one is another mesh, or has"
         ):
             check_objects("bank.npz", other, changed)
+
+    def test_objects_whose_tolerance_has_changed_are_refused(self):
+        mesh = self.folder / f"{SOUP}.obj"
+        trimesh.creation.box((0.05, 0.06, 0.07)).export(mesh)
+        tolerance = mesh.with_suffix(".toml")
+        tolerance.write_text("tolerance = 0.001")
+        spam = load_object(SPAM)
+        fine = load_object(SOUP, self.folder)
+        self.assertEqual(fine.source, object_source(SOUP, self.folder))
+        bank = toy_bank(self.robot, object_sources=(fine.source, "stand-in"))
+        check_objects("bank.npz", bank, (fine, spam))
+        tolerance.unlink()
+        coarse = load_object(SOUP, self.folder)
+        with self.assertRaisesRegex(FileFormatError, "has another tolerance in NAME.toml"):
+            check_objects("bank.npz", bank, (coarse, spam))
+        before = toy_bank(self.robot, object_sources=(file_hash(mesh), "stand-in"))
+        for obj in (fine, coarse):  # 0.3 did not state it
+            check_objects("bank.npz", before, (obj, spam))
 
     def test_another_mesh_is_refused_before_it_is_cut(self):
         meshes = self.folder / "meshes"

@@ -281,7 +281,8 @@ class ObjectSpec(Brief):
     faces: np.ndarray
     """[F, 3] triangles, outward."""
     source: str = "stand-in"
-    """Where the geometry comes from: ``stand-in`` or the mesh file's SHA-256."""
+    """Where the geometry comes from: ``stand-in``, or the mesh file's SHA-256 and the stated tolerance of its pieces
+    [m], ``hull`` without one."""
     friction: float | None = None
     """Coefficient of its material, around which the task draws. None: the task's own range."""
 

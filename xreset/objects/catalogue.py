@@ -8,9 +8,9 @@ from pathlib import Path
 
 from xreset.errors import ObjectError
 from xreset.files.checks import first_repeated
-from xreset.files.storage import file_hash
 from xreset.files.text import short_name, shown
-from xreset.objects.meshes import import_mesh
+from xreset.objects.meshes import import_mesh, mesh_source
+from xreset.objects.properties import properties_of
 from xreset.objects.standins import STAND_INS, stand_in
 from xreset.objects.ycb import ALIAS_OF
 from xreset.spec import ObjectSpec
@@ -131,7 +131,8 @@ def object_source(name: str, meshes: str | Path | None = None) -> str:
     mesh."""
     if meshes is None:
         return stand_in(canonical_name(name)).source
-    return file_hash(_mesh_of(name, meshes)[0])
+    path, _ = _mesh_of(name, meshes)
+    return mesh_source(path, properties_of(path))
 
 
 def _mesh_of(name: str, meshes: str | Path) -> tuple[Path, str]:

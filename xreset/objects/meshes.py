@@ -106,8 +106,8 @@ def import_with_notes(path: str | Path, name: str) -> Import:
     mesh = _without_specks(read_mesh(path), notes)
     own = properties_of(path)
     known = _known_mass(name, own)
-    source = file_hash(path)
-    cut = " ".join((source, *notes))  # earlier versions cut specks, too
+    source = mesh_source(path, own)
+    cut = " ".join((source.split()[0], *notes))  # earlier versions cut specks, too
     try:
         if known is not None:
             _check_density(mesh, known[0])  # at once: cutting takes up to a minute
@@ -158,6 +158,11 @@ def import_with_notes(path: str | Path, name: str) -> Import:
         mass_source=mass_source,
         tolerance=own.tolerance,
     )
+
+
+def mesh_source(path: Path, own: Properties) -> str:
+    """Return the :attr:`~xreset.spec.ObjectSpec.source` of the object of a mesh file with stated properties."""
+    return f"{file_hash(path)} {own.tolerance or 'hull'}"
 
 
 def _known_mass(name: str, own: Properties) -> tuple[float, str] | None:

@@ -291,16 +291,22 @@ def check_sources(path: str | Path, stated: Mapping[str, str], given: Mapping[st
     """
     for name, source in stated.items():
         given_source = given.get(name, source)
-        if given_source == source:
+        if same_source(source, given_source):
             continue
         used = _described(source)
         found = _described(given_source)
         if found == used:
-            found = "another mesh"
+            found = "another mesh, or has another tolerance in NAME.toml"
         raise FileFormatError(
             f"{path} was made with {used} of {name}, but the given one is {found}. Give the same folder of meshes "
             "(--meshes), or make it again."
         )
+
+
+def same_source(one: str, other: str) -> bool:
+    """Return whether two sources are of the same geometry. Files of 0.3 do not state the tolerance."""
+    parts = zip(one.split(" "), other.split(" "), strict=False)
+    return all(a == b for a, b in parts)
 
 
 def _described(source: str) -> str:

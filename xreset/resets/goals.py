@@ -35,6 +35,7 @@ from xreset.resets.bank import (
     check_objects,
     no_states,
     object_columns,
+    same_source,
     stated_sources,
 )
 from xreset.resets.config import GoalConfig
@@ -179,7 +180,7 @@ def with_goals(bank: ResetBank, goals: GoalSet) -> ResetBank:
         )
     sources = stated_sources(bank)
     for name, source in stated_sources(goals).items():
-        if sources.setdefault(name, source) != source:
+        if not same_source(sources.setdefault(name, source), source):
             raise FileFormatError(
                 f"The bank and the goal set were made with different meshes of {name}. Make one again."
             )

@@ -194,8 +194,7 @@ class FingersTest(TestCase):
     def test_two_fingertips_press_harder(self):
         self.assertEqual([SqueezeConfig().newtons(n) for n in (2, 3, 5)], [20.0, 5.0, 5.0])
         self.assertEqual(SqueezeConfig(force=1.0).newtons(2), 1.0)
-        self.assertTrue(SqueezeConfig().presses)
-        self.assertFalse(SqueezeConfig(force=0.0).presses)
+        self.assertEqual(SqueezeConfig(force=0.0).newtons(2), 0.0)
 
     def test_levers_lead_from_the_centre_of_mass_to_the_finger(self):
         fingers, joints = self.fingers(0.0201)

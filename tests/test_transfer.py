@@ -217,12 +217,6 @@ class TransferTest(TestCase):
         assert_array_equal(found.frame_index, plain.frame_index)
         assert_allclose(found.joint_pos, plain.joint_pos, atol=1e-5)
 
-    def test_starts_that_were_settled_change_nothing(self):
-        settled = replace(self.bank, start_pos=self.bank.start_pos + np.float32([0, 0, 0.1]))
-        found, plain = (tried(each, self.data)[0] for each in (settled, self.bank))
-        assert_array_equal(found.joint_pos, plain.joint_pos)
-        assert_array_equal(found.start_pos, settled.start_pos)
-
     def test_every_engine_of_the_bank_must_hold_it(self):
         base = replace(self.bank, engines=("one", "other"))
         first = [True, False, True, True, True, True]

@@ -47,11 +47,6 @@ class SqueezeConfig(Checked):
     alone carry the object's weight and its torque about the line between them. 0: no finger presses, and targets are
     the joints' positions."""
 
-    @property
-    def presses(self) -> bool:
-        """Whether there is any force."""
-        return self.force != 0
-
     def newtons(self, fingertips: int) -> float:
         """Return the force for a hand with this number of fingertips [N]."""
         if self.force is not None:

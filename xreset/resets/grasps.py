@@ -95,31 +95,25 @@ class Grasps(Tensors):
     """Why there is no grasp, if there is none."""
 
 
-def raised(
-    bank: ResetBank, objects: Sequence[ObjectSpec], start: tuple[np.ndarray, np.ndarray]
-) -> np.ndarray:
-    """[L] height of each state's center of mass above that of its demonstration's start pose [S, 3], [S, 4] [m]."""
+def raised(bank: ResetBank, objects: Sequence[ObjectSpec]) -> np.ndarray:
+    """[L] height of each state's center of mass above that at the start of its demonstration [m]."""
     names = bank.object_name
-    start_pos, start_quat = (values[bank.sequence_index] for values in start)
+    sequence = bank.sequence_index
+    start = (bank.start_pos[sequence], bank.start_quat_wxyz[sequence])
     place = centers_of_mass(objects, names, bank.object_pos, bank.object_quat_wxyz)
-    return (place - centers_of_mass(objects, names, start_pos, start_quat))[:, 2]
+    return (place - centers_of_mass(objects, names, *start))[:, 2]
 
 
-def carried(
-    bank: ResetBank,
-    robot: RobotSpec,
-    objects: Sequence[ObjectSpec],
-    start: tuple[np.ndarray, np.ndarray],
-) -> np.ndarray:
-    """[L] bool: whether a state's hand presses on an object in the air; ``start`` as in :func:`raised`."""
+def carried(bank: ResetBank, robot: RobotSpec, objects: Sequence[ObjectSpec]) -> np.ndarray:
+    """[L] bool: whether a state's hand presses on an object in the air."""
     hand = robot.hand_indices
     presses = (bank.targets[:, hand] != bank.joint_pos[:, hand]).any(axis=1)
-    return presses & (raised(bank, objects, start) > _CARRIED)
+    return presses & (raised(bank, objects) > _CARRIED)
 
 
 def grasps_of_bank(bank: ResetBank, robot: RobotSpec, obj: ObjectSpec) -> Grasps:
     """Return the grasps of an object in which a bank's hand presses on it in the air."""
-    is_carried = carried(bank, robot, (obj,), (bank.start_pos, bank.start_quat_wxyz))
+    is_carried = carried(bank, robot, (obj,))
     rows = np.flatnonzero((bank.object_name == obj.name) & bank.own_grasp & is_carried)
     model = ArmModel(robot)
     joints = torch.as_tensor(bank.joint_pos[rows], dtype=torch.float64)

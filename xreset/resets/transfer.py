@@ -89,7 +89,7 @@ def add_transfers(
         device: where engines run that can use it; the others run on the CPU.
         progress: called with what is done and what is to be done in all.
     """
-    grasps = np.flatnonzero(carried(bank, robot, objects, retargeted.start_pose))
+    grasps = np.flatnonzero(carried(bank, robot, objects))
     if not len(grasps):
         return bank
     poses = _raised_frames(retargeted, objects)

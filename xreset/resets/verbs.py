@@ -114,7 +114,7 @@ def make_bank(
         device=device,
         progress=partial(progress, f"states stable in {', '.join(engines)}"),
     )
-    if transfer.per_pose and squeeze.presses:
+    if transfer.per_pose and force:
         bank = add_transfers(
             bank,
             motion,

@@ -219,7 +219,7 @@ def _grasps(
     squeeze: SqueezeConfig,
 ) -> tuple[ResetBank, State]:
     """Return the states to try, and how they start: at rest, with targets that press on the object."""
-    height = raised(bank, objects, (bank.start_pos, bank.start_quat_wxyz))
+    height = raised(bank, objects)
     lifted = bank.with_states(np.flatnonzero(bank.own_grasp & bank.post_contact & (height > LIFT)))
     if not lifted.num_states:
         raise RobotError(

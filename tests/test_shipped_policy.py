@@ -111,10 +111,10 @@ class ShippedPolicyTest(unittest.TestCase):
         for name, file in shipped().items():
             with self.subTest(name):
                 first = OnnxPolicy(file).contract.objects[0]
-                demos = upright(EASIER.get(name, first), 4, seed=3)
+                demos = upright(EASIER.get(name, first), 2, seed=3)
                 with tempfile.TemporaryDirectory() as folder:
-                    options = {"num_envs": 4, "episodes": 1, "episode_seconds": 3.0}
+                    options = {"num_envs": 2, "episodes": 1, "episode_seconds": 3.0}
                     (result,) = evaluate(name, demos, out=folder, **options)
                 self.assertEqual(list(result.inputs), ["policy", "demos"])
-                self.assertEqual(len(result.episodes), 4)
+                self.assertEqual(len(result.episodes), 2)
                 self.assertGreaterEqual(result.mean("task_progress"), FLOOR)

@@ -3,6 +3,7 @@
 import io
 import json
 import math
+import multiprocessing
 import os
 import pty
 import shutil
@@ -23,7 +24,7 @@ from numpy.testing import assert_array_equal
 from onnx import numpy_helper
 from torch.testing import assert_close
 
-from tests.command import calls_of, refused, started, succeeds
+from tests.command import calls_of, refused, succeeds
 from tests.data import refuses
 from tests.toy_bank import SOUP, SPAM, toy_bank
 from tests.toy_goals import toy_goals
@@ -102,6 +103,13 @@ def work_in_a_terminal(file):
         os._exit(0)
     finally:
         os._exit(1)
+
+
+def run_command(words, printed):
+    """Run a command in a fork, and write what it prints to a file."""
+    torch.set_num_threads(1)  # the other threads are not in the fork
+    with printed.open("w") as file, redirect_stdout(file), redirect_stderr(file):
+        main(words)
 
 
 class TrainingTest(WithBank):
@@ -341,23 +349,26 @@ class TrainingTest(WithBank):
             ppo = { horizon = 8, mini_epochs = 2, minibatch_size = 16 }
             """
         )
-        command = (
-            f"-m xreset train --out {out} --resets {self.bank} --engine mujoco --device cpu --num-envs 4"
-            f" --recipe {recipe}"
-        )
-        words = [sys.executable, *command.split()]
-        process = self.enterContext(started(*words))
-        while len(checkpoints(out)) < 2 and process.poll() is None:
+        words = f"train --out {out} --resets {self.bank} --engine mujoco --device cpu --num-envs 4".split()
+        words += ["--recipe", str(recipe)]
+        printed = self.folder / "printed.txt"
+        # a fork has imported everything
+        fork = multiprocessing.get_context("fork")
+        process = fork.Process(target=run_command, args=(words, printed))
+        process.start()
+        self.addCleanup(process.kill)
+        while len(checkpoints(out)) < 2 and process.is_alive():
             time.sleep(0.05)
-        process.send_signal(signal.SIGTERM)
-        said = process.communicate()[0]
-        self.assertEqual(process.returncode, 128 + signal.SIGTERM, said)
+        process.terminate()
+        process.join(120)
+        said = printed.read_text()
+        self.assertEqual(process.exitcode, 128 + signal.SIGTERM, said)
         done = newest(out).iteration
         self.assertLess(done, 60)
         self.assertIn("a checkpoint is written", said)
         self.assertTrue((out / "policy.onnx").is_file())
         with quickly() as again:
-            main([*words[3:], "--iterations", str(done + 1)])
+            main([*words, "--iterations", str(done + 1)])
         self.assertIn(f"continuing after iteration {done}\n", again.getvalue())
         self.assertEqual(newest(out).iteration, done + 1)
 

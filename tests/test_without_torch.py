@@ -6,7 +6,6 @@ import sys
 from tests.data import InFolder
 from tests.toy_results import toy_result
 from xreset.eval.results import write_result
-from xreset.policy.shipped import shipped_graphs
 
 BLOCKED = """
 import sys
@@ -44,6 +43,16 @@ assert np.ptp([m.joint_target for m in session.history], axis=0).max() == 0
 write_trace("play.trace.npz", session)
 write_film("play.mp4", session, seconds=0.1)
 """
+CAMERA = """
+from xreset.errors import PolicyError
+from xreset.eval.play.session import Session
+try:
+    Session('many-objects-camera')
+except PolicyError as error:
+    assert 'has cameras' in str(error), error
+else:
+    raise AssertionError('it plays')
+"""
 
 
 class WithoutTorchTest(InFolder):
@@ -55,40 +64,23 @@ class WithoutTorchTest(InFolder):
         self.assertEqual(done.returncode, 0, done.stderr[-3000:])
         return done.stdout
 
-    def run_commands(self, *commands):
-        calls = [f"main({command.split()!r})\n" for command in commands]
-        return self.run_blocked("from xreset.cli import main\n" + "".join(calls))
-
     def test_a_policy_plays(self):
         distance = float(self.run_blocked(PLAY))
         self.assertLess(distance, 0.03)
         self.assertTrue((self.folder / "play.mp4").stat().st_size)
 
-    def test_policies_are_listed_and_one_with_cameras_is_refused(self):
-        found = self.run_blocked(
-            "from xreset.cli import main\n"
-            "main(['policies'])\n"
-            "from xreset.errors import PolicyError\n"
-            "from xreset.eval.play.session import Session\n"
-            "try:\n"
-            "    Session('many-objects-camera')\n"
-            "except PolicyError as error:\n"
-            "    assert 'has cameras' in str(error), error\n"
-            "else:\n"
-            "    raise AssertionError('it plays')\n"
-        )
-        self.assertIn("many-objects-camera: ", found)
-
-    def test_policies_are_exported_and_demonstrations_and_results_shown(self):
+    def test_commands_list_export_view_and_report(self):
         write_result(self.folder / "run" / "eval", toy_result(), [], ("a",))
-        names = shipped_graphs()
-        found = self.run_commands(
-            *map("export deploy {0} --out on_robot/{0} --object soup".format, names),
+        commands = (
+            "policies",
+            "export deploy openarm --out on_robot --object soup",
             "demos synth --objects soup --per-object 1 --out demos.npz",
             "view demos.npz --out demos.png",
             "report run --out page",
         )
-        for name in names:
-            self.assertTrue((self.folder / "on_robot" / name / "policy.onnx").exists(), name)
+        calls = "".join(f"main({command.split()!r})\n" for command in commands)
+        found = self.run_blocked(f"from xreset.cli import main\n{calls}{CAMERA}")
+        self.assertIn("many-objects-camera: ", found)
+        self.assertTrue((self.folder / "on_robot" / "policy.onnx").exists())
         self.assertIn("page: page", found)
         self.assertTrue((self.folder / "page" / "index.html").exists())

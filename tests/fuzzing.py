@@ -24,7 +24,7 @@ from tests.test_keypoints import PLAIN, write_csv
 from tests.test_view import toy_demos, toy_retargeted
 from tests.toy_bank import SOUP, toy_bank
 from tests.toy_goals import toy_goals
-from tests.toy_policy import write_policy
+from tests.toy_policy import toy_graph, write_policy
 from tests.toy_results import toy_result, toy_rollouts
 from tests.toy_robot import toy_hand_arm
 from xreset import (
@@ -56,7 +56,7 @@ from xreset.learning.checkpoint import Checkpoint, read_checkpoint, write_checkp
 from xreset.learning.clock import Lift, read_lift, write_lift
 from xreset.learning.recipes import read_recipe
 from xreset.learning.run import RunInfo, read_run, write_run
-from xreset.live.deploy import deploy_contract, deployed_graph
+from xreset.live.deploy import deploy_contract
 from xreset.objects.meshes import read_mesh
 from xreset.objects.properties import properties_of
 from xreset.pictures.view.load import load_view
@@ -246,8 +246,7 @@ def add_networks(every):
 
 def add_deployed(every):
     path = every.add("deployed policy", "deployed.onnx", load_controller, "bytes")
-    network = write_policy(path, asdict(every.contract)).read_bytes()
-    path.write_bytes(deployed_graph(network, every.toy, every.contract.task))
+    path.write_bytes(toy_graph()[1])
 
     def read(path):
         return parse_contract({KEY: path.read_text(errors="replace")}, str(path))

@@ -1,14 +1,13 @@
 """A policy leaves xreset: one graph from readings to joint targets, in a folder that runs without xreset."""
 
 import contextlib
-import functools
 import hashlib
 import json
 import os
 import shutil
 import subprocess
 import sys
-from dataclasses import asdict, replace
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from types import SimpleNamespace
@@ -26,7 +25,7 @@ from tests.command import refused, succeeds
 from tests.data import InFolder, refuses
 from tests.test_examples import EXAMPLES, run
 from tests.toy_bank import SOUP
-from tests.toy_policy import write_policy
+from tests.toy_policy import toy_graph
 from tests.toy_robot import endless_robot
 from xreset import (
     CameraConfig,
@@ -42,7 +41,7 @@ from xreset.live import cache
 from xreset.live.deploy import deployed_graph, with_objects, write_deployed
 from xreset.live.engine import EngineDriver
 from xreset.live.graph import policy_graph
-from xreset.policy.onnx_policy import OnnxPolicy, policy_contract
+from xreset.policy.onnx_policy import OnnxPolicy
 from xreset.runtime import Controller, LiveError, Reading, load_controller
 from xreset.runtime.contract import KEY, parse_contract
 from xreset.task.config import ObservationConfig, evaluation_task
@@ -72,14 +71,6 @@ for k in range(len(data["target"])):
 modules = sorted({"xreset", "torch", "scipy", "onnx"} & set(sys.modules))
 print(json.dumps({"worst": worst, "modules": modules}))
 """
-
-
-@functools.cache
-def toy_graph(network):
-    """Return the graph of a policy of the toy gripper."""
-    return deployed_graph(
-        network, toy_grasp.robot(), evaluation_task(TaskConfig()), [toy_grasp.brick()]
-    )
 
 
 def recorded(name, object_name, steps):
@@ -135,9 +126,9 @@ class ToyTest(InFolder):
 
     def setUp(self):
         super().setUp()
-        trained = asdict(policy_contract(self.robot, self.task, ("brick",)))
-        self.network = write_policy(self.folder / "toy.onnx", trained, value=0.01)
-        self.graph = toy_graph(self.network.read_bytes())
+        network, self.graph = toy_graph()
+        self.network = self.folder / "toy.onnx"
+        self.network.write_bytes(network)
         self.out = self.folder / "out"
         write_deployed(self.graph, self.out)
         self.controller = load_controller(self.out)

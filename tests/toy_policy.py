@@ -1,11 +1,29 @@
 """A policy of one matrix, written as ONNX by hand: in every way that an exported one could be wrong."""
 
 import json
+import tempfile
+from dataclasses import asdict
+from functools import cache
+from pathlib import Path
 
 import numpy as np
 from onnx import TensorProto, helper, numpy_helper
 
-from xreset.policy.onnx_policy import observation_shapes, parsed_contract
+from tests import toy_grasp
+from xreset.live.deploy import deployed_graph
+from xreset.policy.onnx_policy import observation_shapes, parsed_contract, policy_contract
+from xreset.task.config import TaskConfig, evaluation_task
+
+
+@cache
+def toy_graph():
+    """Return the network of a policy of the toy gripper, and the policy as one graph."""
+    robot = toy_grasp.robot()
+    task = evaluation_task(TaskConfig())
+    trained = asdict(policy_contract(robot, task, ("brick",)))
+    with tempfile.TemporaryDirectory() as folder:
+        network = write_policy(Path(folder) / "toy.onnx", trained, value=0.01).read_bytes()
+    return network, deployed_graph(network, robot, task, [toy_grasp.brick()])
 
 
 def write_policy(

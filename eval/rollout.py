@@ -25,7 +25,7 @@ from xreset.eval.policy_spec import PolicySpec
 from xreset.eval.results import Rollouts, Trace
 from xreset.files.checks import frozen
 from xreset.files.progress import Progress, unseen
-from xreset.files.records import schema_of, stated_inputs
+from xreset.files.records import schema_of
 from xreset.physics import Backend, State
 from xreset.physics.plugins import backend_class, device_for, make_backend
 from xreset.policy.onnx_policy import Policy
@@ -203,12 +203,9 @@ def load_trial(
 def _hash_of_demos(inputs: Inputs) -> str:
     """Return the SHA-256 of the demonstrations' file, also for motion that was made of it; of starts and goals that are
     in no file."""
-    if inputs.path and isinstance(inputs.data, Retargeted):
-        stated = stated_inputs(inputs.path).get("demos")
-        if stated:
-            return stated
-    if inputs.hash:
-        return inputs.hash
+    stated = inputs.made_from.get("demos") or inputs.hash
+    if stated:
+        return stated
     bank = inputs.bank
     digest = sha256()
     for name, column in schema_of(ResetBank).items():

@@ -90,8 +90,9 @@ class InputsTest(InOneFolder):
         inputs = {f"object {SOUP}": block.source, "object robot": "a toy", "robot": "openarm"}
         file = folder / "motion.npz"
         write_retargeted(file, motion, config={"meshes": "meshes"}, inputs=inputs)
-        self.assertEqual(object_sources(file)["robot"], "a toy")
+        self.assertEqual(object_sources(inputs)["robot"], "a toy")
         found = load_inputs(file)
+        self.assertEqual(found.made_from, inputs)
         self.assertEqual((found.meshes, found.objects[0].source), (folder / "meshes", block.source))
         other = folder / "other"
         other.mkdir()

@@ -3,8 +3,8 @@ objects."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Literal
@@ -14,7 +14,7 @@ from xreset.demos.archive import Demos, demo_objects, read_demos, rest_on_table
 from xreset.errors import DemoError, FileFormatError, XResetError
 from xreset.files.checks import frozen
 from xreset.files.progress import Progress, unseen
-from xreset.files.records import npz_schema, stated_meshes, stated_robot
+from xreset.files.records import npz_schema, stated_inputs, stated_meshes, stated_robot
 from xreset.files.storage import file_hash
 from xreset.files.text import shown
 from xreset.geometry.description import load_robot
@@ -59,6 +59,8 @@ class Inputs:
     """File of the data; None: the data never were in a file."""
     hash: str | None = None
     """SHA-256 of the file when it was read."""
+    made_from: Mapping[str, str] = field(default_factory=dict)
+    """What a file of motion was made from: name -> SHA-256."""
     meshes: Path | None = None
     """Folder of object meshes; None: the built-in stand-ins."""
     robot_name: str | None = None
@@ -154,6 +156,9 @@ def load_inputs(
         folder = stated_meshes(path)
     if folder is None and else_meshes:
         folder = Path(else_meshes)
+    made_from = {}
+    if path is not None and isinstance(data, Retargeted):
+        made_from = stated_inputs(path)
     names = data.object_names
     if only:
         names = tuple(dict.fromkeys(canonical_names(only, names)))
@@ -163,11 +168,9 @@ def load_inputs(
         by_name = demo_objects(data, folder)
         loaded = tuple(by_name[name] for name in names)
     else:
-        stated = {}
+        stated = object_sources(made_from)
         if isinstance(data, ResetBank):
             stated = stated_sources(data)
-        elif path is not None:
-            stated = object_sources(path)
         if robot is None and path is not None:
             robot = robot_of_file(path, stated_robot(path) or data.robot, data.robot)
         robot = robot or data.robot
@@ -189,6 +192,7 @@ def load_inputs(
         objects=loaded,
         path=path,
         hash=file_hash(path) if path else None,
+        made_from=made_from,
         meshes=folder,
         robot_name=robot_name,
         loaded_robot=spec,

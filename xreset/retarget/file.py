@@ -31,7 +31,6 @@ from xreset.files.records import (
     Arrays,
     Field,
     read_record,
-    stated_inputs,
     write_record,
 )
 from xreset.geometry.urdf import joint_limits
@@ -151,10 +150,9 @@ def check_retargeted(path: str | Path, data: Retargeted, robot: RobotSpec) -> No
         )
 
 
-def object_sources(path: str | Path) -> dict[str, str]:
-    """Return object name -> :attr:`~xreset.spec.ObjectSpec.source` of the objects that the file was made with; empty if
-    it does not state them."""
-    inputs = stated_inputs(path)
+def object_sources(inputs: Mapping[str, str]) -> dict[str, str]:
+    """Return object name -> :attr:`~xreset.spec.ObjectSpec.source` of the objects among the inputs that a file
+    states."""
     objects = [name for name in inputs if name.startswith("object ")]
     return {name.removeprefix("object "): inputs[name] for name in objects}
 

@@ -49,11 +49,9 @@ def roll_out_on_robot(
         nonlocal steps
         env = played.env
         begin_episodes(controller, env)
-        seeds = [
-            (trial.seed, int(sequence), int(repetition))
-            for sequence, repetition in zip(played.sequence, played.repetition, strict=True)
-        ]
-        driver = FaultyDriver(env, faults, seeds, lambda: played.update_metrics(env.reading()))
+        driver = FaultyDriver(
+            env, faults, played.seeds, lambda: played.update_metrics(env.reading())
+        )
         length = env.max_episode_length * controller.dt
         outcome = SimulatedRunner(controller, driver).run(length)
         driver.wait_until(length)  # a runner ends early if it has stopped all of its robots

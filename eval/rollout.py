@@ -275,6 +275,8 @@ class Round:
     """[N] index of each world's demonstration."""
     repetition: np.ndarray
     """[N] number of the perturbation of its start."""
+    seeds: list[tuple[int, int, int]]
+    """N seeds of what is drawn in each world: the trial's, the demonstration and the repetition."""
     fresh: list[int]
     """Worlds that play a new episode; the others repeat one, because all worlds of an engine step together."""
     number: int
@@ -313,9 +315,13 @@ def play_rounds(
         points = points[env.backend.object_index]
         for number, (items, fresh) in enumerate(plan):
             start = episode_starts(starts, sequence[items], repetition[items], trial.seed)
-            env.reset(start=start.to(env.device))
+            seeds = []
+            for s, r in zip(sequence[items].tolist(), repetition[items].tolist(), strict=True):
+                seeds.append((trial.seed, s, r))
+            env.reset(start=start.to(env.device), seeds=seeds)
             played = Round(
                 env=env,
+                seeds=seeds,
                 metrics=EpisodeMetrics(env.reading(), env.task_goal_pos, env.goal_quat, points),
                 sequence=sequence[items],
                 repetition=repetition[items],

@@ -27,7 +27,7 @@ from xreset.eval.engines.recording import play
 from xreset.eval.metrics import METRICS, EpisodeMetrics, MetricPoints
 from xreset.eval.report.groups import estimate
 from xreset.eval.results import Evaluation, read_evaluation, read_traces, write_result
-from xreset.eval.rollout import chosen_engines, engine, load_trial, roll_out
+from xreset.eval.rollout import chosen_engines, engine, load_trial, play_rounds, roll_out
 from xreset.eval.stats import bootstrap_ci95, share_ci95
 from xreset.eval.table import result_rows
 from xreset.files.storage import claim_folder
@@ -308,6 +308,26 @@ class RecordedTest(TestCase):
         self.assertGreater(
             len({e.least_distance for e in found.episodes}), 2, "each world is judged by itself"
         )
+
+    def test_directions_do_not_depend_on_the_number_of_worlds(self):
+        task = TaskConfig(
+            reset=toy_grasp.AT_HOME, randomization=RandomizationConfig(object_com=(0.01, 0.01))
+        )
+        offsets = []
+        for worlds in (1, 3):
+            found = {}
+
+            def note(played, found=found):
+                com = played.env.variation.parameters["object_com"]
+                for world in played.fresh:
+                    found[int(played.sequence[world])] = com[world].tolist()
+
+            trial = toy_grasp.trial(task, num_envs=worlds)
+            play_rounds(engine("mujoco", workers=0), trial, 1, note)
+            offsets.append(np.array([found[sequence] for sequence in range(3)]))
+        assert_array_equal(offsets[0], offsets[1])
+        assert_allclose(np.linalg.norm(offsets[0], axis=1), 0.01, rtol=1e-5)
+        self.assertGreater(np.ptp(offsets[0], axis=0).min(), 1e-3)
 
     def test_the_same_engine_repeats_the_episode_with_its_recorded_targets(self):
         task = TaskConfig(

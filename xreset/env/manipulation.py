@@ -337,12 +337,18 @@ class ManipulationEnv:
         self._compute_observations()
         return reading, reward
 
-    def reset(self, worlds: Tensor | None = None, start: Reset | None = None) -> None:
+    def reset(
+        self,
+        worlds: Tensor | None = None,
+        start: Reset | None = None,
+        seeds: Sequence[Sequence[int]] | None = None,
+    ) -> None:
         """Start new episodes. The other worlds and their observations stay as they are.
 
         Args:
             worlds: [M] long indices of worlds; None: all worlds.
             start: M starts; None: they are drawn from the reset distribution.
+            seeds: seed of each world, for :meth:`Worlds.redirect`; None: directions are drawn like everything else.
 
         Raises:
             XResetError: there is no such world.
@@ -362,6 +368,8 @@ class ManipulationEnv:
             self._new_start[worlds] = start
         before = self.worlds.clone()
         self._sample_resets(start is None)
+        if seeds is not None:
+            self.worlds.redirect(seeds)
         self._write_resets()
         self._take_images()
         self._compute_observations()

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
 from typing import TypeVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -59,6 +60,21 @@ class Worlds:
         for sample, buffer in self._samples:
             values = sample(generator).view_as(buffer)
             buffer.copy_(where(fresh, values, buffer))
+
+    def redirect(self, seeds: Sequence[Sequence[int]]) -> None:
+        """Turn what is drawn in any direction so that the seed of each world alone decides where it points."""
+        for number, name in enumerate(("object_com", "camera_shift", "camera_turn")):
+            if name not in self.buffers:
+                continue
+            offset = self.buffers[name]
+            rows = []
+            for seed in seeds:
+                random = np.random.default_rng([*seed, number])
+                rows.append(random.normal(size=offset.shape[1:]))
+            direction = torch.nn.functional.normalize(torch.as_tensor(np.array(rows)), dim=-1)
+            # whole micrometres, because the former direction has rounded the length
+            length = offset.double().norm(dim=-1, keepdim=True).round(decimals=6)
+            offset.copy_(length * direction.to(length))
 
     def clone(self) -> dict[str, Tensor]:
         """Return a copy of all buffers by name."""

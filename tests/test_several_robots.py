@@ -25,9 +25,11 @@ from xreset import (
 from xreset.env.manipulation import make_env
 from xreset.env.several import SeveralEnvs
 from xreset.errors import PolicyError, RobotError, RunError, XResetError
-from xreset.learning.model import CLIP_OBSERVATIONS, Gaussian, PointNet, Trunk
+from xreset.learning.checkpoint import read_checkpoint
+from xreset.learning.model import CLIP_OBSERVATIONS, Gaussian, PointNet, PointNetLstmModel, Trunk
 from xreset.learning.recipes import for_robots
-from xreset.learning.run import checkpoints, read_run
+from xreset.learning.run import checkpoints, latest_checkpoint, read_run
+from xreset.learning.train import config_of_student
 from xreset.live.engine import GraphPolicy
 from xreset.objects.catalogue import load_objects
 from xreset.runtime import Controller
@@ -290,6 +292,29 @@ class TrainingTest(InOneFolder):
         with self.assertRaisesRegex(PolicyError, "Start from its configuration"):
             out = self.folder / "wrong"
             train(self.banks[1], out=out, weights=self.out, recipe="default", **OPTIONS)
+
+    def test_a_student_of_one_robot_learns_from_a_teacher_of_several(self):
+        """What the teacher says about actions that the robot lacks has no part in it."""
+        config = config_of_student(self.out)
+        vision = replace(config.task.vision, width=16, height=12, points=8)
+        task = replace(config.task, vision=vision)
+        config = replace(config, task=task, model=CONFIG.model, iterations=1)
+        forward = PointNetLstmModel.forward
+        weights = []
+        for i, said in enumerate((0.0, 0.5)):
+
+            def answer(model, obs, *args, said=said, **options):
+                actions = forward(model, obs, *args, **options)
+                mask = obs.get("action_mask", None)
+                if model.distribution is not None or mask is None:
+                    return actions
+                return torch.where(mask > 0, actions, said)
+
+            with quickly(), patch.object(PointNetLstmModel, "forward", answer):
+                out = self.folder / f"student-{i}"
+                train(self.banks[1], teacher=self.out, out=out, config=config, **OPTIONS)
+            weights.append(read_checkpoint(latest_checkpoint(out)).actor_state_dict)
+        assert_close(*weights, rtol=0, atol=0)
 
     def test_banks_that_do_not_go_together(self):
         out = self.folder / "refused"

@@ -82,10 +82,12 @@ class SequenceDistillation(Distillation):
             for worlds in order.tensor_split(self.num_mini_batches):
                 states = piece_states(storage.saved_hidden_state_a, worlds, self.sequence_length)
                 first = first_steps(storage, worlds)
-                actions = self.student(
-                    storage.observations[:, worlds], masks=first, hidden_state=states
-                )
-                loss = self.loss_fn(actions, storage.privileged_actions[:, worlds])
+                observations = storage.observations[:, worlds]
+                actions = self.student(observations, masks=first, hidden_state=states)
+                # nothing is learned about actions that a robot lacks
+                mask = observations.get("action_mask", 1.0)
+                taught = storage.privileged_actions[:, worlds]
+                loss = self.loss_fn(mask * actions, mask * taught)
                 self.optimizer.zero_grad()
                 loss.backward()
                 if self.is_multi_gpu:

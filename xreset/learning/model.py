@@ -276,8 +276,8 @@ class PointNetLstmModel(MLPModel):
         self.state: LstmState | None = None
 
     def forward(self, obs: TensorDict, *args: Any, **options: Any) -> Tensor:
-        """[..., outputs]; an actor's actions are masked by the observation ``action_mask``, if there is one."""
-        if isinstance(self.distribution, Gaussian):
+        """[..., outputs]; those that an actor draws are masked by the observation ``action_mask``, if there is one."""
+        if options.get("stochastic_output") and isinstance(self.distribution, Gaussian):
             self.distribution.mask = obs.get("action_mask", None)
         return super().forward(obs, *args, **options)
 

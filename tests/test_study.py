@@ -84,6 +84,10 @@ class FileTest(Studied):
                 f"{a}[[tables]]\npaper = 'I'\nruns = {{ a = 'A' }}",
                 r"runs is 'A', expected one of 'IK Oracle'",
             ),
+            (
+                f"{a}[runs.b]\n[[tables]]\nruns = {{ a = 'A', b = 'A' }}",
+                r"tables\[0\]\.runs has two runs with the name 'A'",
+            ),
         ):
             with refuses(self, message, FileFormatError):
                 read_study(self.file(BASE + text))

@@ -44,6 +44,7 @@ from xreset.files.checks import (
     PositiveInt,
     Rule,
     Seed,
+    first_repeated,
     from_dict,
     frozen,
     merged,
@@ -257,6 +258,11 @@ def _check_names(study: Study) -> None:
         _expect(f"{where}.evaluation", study.evaluations, table.evaluation)
         _expect(f"{where}.metric", metrics, table.metric)
         _expect(f"{where}.runs", study.runs, *table.runs)
+        shown = list(table.runs.values())
+        if (repeated := first_repeated(shown)) is not None:
+            raise ValueError(
+                f"{where}.runs has two runs with the name {shown[repeated]!r}. Give each its own name."
+            )
         if table.paper:
             methods = dict.fromkeys(method for method, _, _ in papers[table.paper].figures())
             _expect(f"{where}.runs", methods, *table.runs.values())

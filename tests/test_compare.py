@@ -291,6 +291,16 @@ class GroupTest(Compared):
             found = self.groups(*(f"{name}-{i}" for i in range(3)))
             self.assertEqual(found, ([(name, 2), (f"{name}-2", 1)], ""))
 
+    def test_several_processes_are_another_training(self):
+        for i, processes in enumerate((1, 2, 2)):
+            self.run_and_results(f"p-{i}", seed=i)
+            steps = 10 * TrainConfig().ppo.horizon * 64 * processes
+            write_lift(self.folder / f"p-{i}", Lift(iteration=10, env_steps=steps))
+        found = self.groups("p-0", "p-1", "p-2")
+        self.assertEqual(found, ([("p-0", 1), ("p", 2)], ""))
+        facts = self.training("p-1").facts
+        self.assertEqual(facts["num_envs"], "64 in each of 2 processes")
+
     def test_names_of_groups(self):
         for names, expected in (
             (("X s0", "X s1"), "X"), (("run10", "run11"), "run"), (("first", "second"), "first + second"), (("seed0", "seed1"), "seed"),

@@ -301,6 +301,11 @@ def _with_run(training: Training) -> Training:
         except FileFormatError as error:
             # results are shown even if an older configuration is unreadable
             notes.append(f"The training is not described here: {error}")
+    lift = training.lift
+    if run is not None and lift.iteration:
+        steps = lift.iteration * run.config.ppo.horizon * run.num_envs
+        if lift.env_steps != steps:
+            facts["num_envs"] += f" in each of {lift.env_steps / steps:.3g} processes"
     sweeps = []
     if training.results:
         policies = {result.inputs.get("policy") for result in training.results.values()}

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import field, fields, replace
 from hashlib import sha256
@@ -314,10 +314,10 @@ def play_rounds(
         points = MetricPoints.of(trial.objects, trial.task.object_frame).to(env.device)
         points = points[env.backend.object_index]
         for number, (items, fresh) in enumerate(plan):
-            start = episode_starts(starts, sequence[items], repetition[items], trial.seed)
             seeds = []
             for s, r in zip(sequence[items].tolist(), repetition[items].tolist(), strict=True):
                 seeds.append((trial.seed, s, r))
+            start = episode_starts(starts, seeds)
             env.reset(start=start.to(env.device), seeds=seeds)
             played = Round(
                 env=env,
@@ -334,24 +334,21 @@ def play_rounds(
     return tuple(sorted(found, key=lambda e: (e.sequence, e.repetition)))
 
 
-def episode_starts(
-    distribution: ResetDistribution, sequence: np.ndarray, repetition: np.ndarray, seed: int
-) -> Reset:
+def episode_starts(distribution: ResetDistribution, seeds: Sequence[tuple[int, int, int]]) -> Reset:
     """Return one start for each world, on the CPU.
 
-    A start depends only on the seed, the demonstration and the repetition, not on the engine and the number of worlds.
+    A start depends only on its seed, not on the engine and the number of worlds.
 
     Args:
         distribution: distribution of starts.
-        sequence: [N] index of each world's demonstration.
-        repetition: [N] number of the perturbation.
-        seed: seed of the perturbations.
+        seeds: N seeds; see :attr:`Round.seeds`.
     """
     parts = []
-    for s, r in zip(sequence.tolist(), repetition.tolist(), strict=True):
-        state = np.random.SeedSequence([seed, s, r]).generate_state(1)
+    for seed in seeds:
+        state = np.random.SeedSequence(seed).generate_state(1)
         generator = torch.Generator().manual_seed(int(state[0]))
-        parts.append(distribution.home(torch.tensor([s]), generator))
+        _, sequence, _ = seed
+        parts.append(distribution.home(torch.tensor([sequence]), generator))
     return Reset.cat(parts)
 
 

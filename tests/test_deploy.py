@@ -77,10 +77,9 @@ def recorded(name, object_name, steps):
     """Return readings, goals and targets of the first steps of an evaluation's episode in MuJoCo."""
     spec = load_policy(name)
     trial = load_trial(spec, synthesize([object_name], 1))
-    zero = np.zeros(1, int)
     frames = []
     with trial.worlds(engine("mujoco", workers=0), torch.zeros(1, dtype=torch.long)) as env:
-        env.reset(start=episode_starts(trial.starts(), zero, zero, seed=0))
+        env.reset(start=episode_starts(trial.starts(), [(0, 0, 0)]))
         policy = spec.begin(env)
         values = {"goal_pos": env.goal_pos, "goal_quat": env.goal_quat, "start": env.joint_target}
         recording = {name: value[0].numpy().copy() for name, value in values.items()}

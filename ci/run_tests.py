@@ -27,9 +27,9 @@ QUICK = (
 """Tests of `--quick`, which need neither physics nor all of the package: modules, classes or methods."""
 
 SLOW = (
-    "conformance_engines", "import_robot", "examples", "training", "study", "shipped_policy", "parity", "fuzz", "learns",
-    "objects", "cli", "distributed", "arm", "retarget", "report", "without_torch", "compare", "deploy", "play_browser",
-    "try_page",
+    "conformance_engines", "import_robot", "examine", "training", "examples", "backends_mujoco", "study", "learns",
+    "shipped_policy", "objects", "deploy", "arm", "parity", "cli", "report", "retarget", "distributed",
+    "mujoco_warp_depth", "demos", "play", "play_browser", "try_page",
 )  # fmt: skip
 """Modules that begin first, so that none of them is alone at the end."""
 

@@ -180,6 +180,7 @@ class Wrong(InFolder):
 
     def test_mesh_in_another_unit(self):
         demos = synthesize(["soup"], 1, seed=1)
+        self.enterContext(patch("xreset.geometry.surface._MOST_CELLS", 100_000))
         ((name, obj),) = demo_objects(demos).items()
         for scale, words in ((3.2808, "0.3048 times as large"), (0.1, "10 times as large")):
             corners = scale * obj.vertices

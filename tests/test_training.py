@@ -338,23 +338,14 @@ class TrainingTest(WithBank):
 
     def test_a_command_that_is_stopped_exits_with_its_signal_and_the_same_one_finishes(self):
         out = self.folder / "job"
-        recipe = self.folder / "small.toml"
-        recipe.write_text(
-            """
-            about = "seconds on a CPU"
-            iterations = 60
-            save_interval = 1
-            task = { distance_points = 64, observation = { cloud_points = 16 } }
-            model = { pointnet = [8, 6], lstm = 12, mlp = [16] }
-            ppo = { horizon = 8, mini_epochs = 2, minibatch_size = 16 }
-            """
-        )
-        words = f"train --out {out} --resets {self.bank} --engine mujoco --device cpu --num-envs 4".split()
-        words += ["--recipe", str(recipe)]
+        words = (
+            f"train --out {out} --resets {self.bank} --engine mujoco --device cpu --num-envs 4"
+            f" --recipe {self.out} --iterations"
+        ).split()
         printed = self.folder / "printed.txt"
         # a fork has imported everything
-        fork = multiprocessing.get_context("fork")
-        process = fork.Process(target=run_command, args=(words, printed))
+        fork = multiprocessing.get_context("fork").Process
+        process = fork(target=run_command, args=([*words, "60"], printed))
         process.start()
         self.addCleanup(process.kill)
         while len(checkpoints(out)) < 2 and process.is_alive():
@@ -368,7 +359,7 @@ class TrainingTest(WithBank):
         self.assertIn("a checkpoint is written", said)
         self.assertTrue((out / "policy.onnx").is_file())
         with quickly() as again:
-            main([*words, "--iterations", str(done + 1)])
+            main([*words, str(done + 1)])
         self.assertIn(f"continuing after iteration {done}\n", again.getvalue())
         self.assertEqual(newest(out).iteration, done + 1)
 

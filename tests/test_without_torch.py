@@ -47,11 +47,9 @@ CAMERA = """
 from xreset.errors import PolicyError
 from xreset.eval.play.session import Session
 try:
-    Session('many-objects-camera')
+    Session("many-objects-camera")
 except PolicyError as error:
-    assert 'has cameras' in str(error), error
-else:
-    raise AssertionError('it plays')
+    print("refused:", error)
 """
 
 
@@ -81,6 +79,7 @@ class WithoutTorchTest(InFolder):
         calls = "".join(f"main({command.split()!r})\n" for command in commands)
         found = self.run_blocked(f"from xreset.cli import main\n{calls}{CAMERA}")
         self.assertIn("many-objects-camera: ", found)
+        self.assertRegex(found, "refused: .*has cameras")
         self.assertTrue((self.folder / "on_robot" / "policy.onnx").exists())
         self.assertIn("page: page", found)
         self.assertTrue((self.folder / "page" / "index.html").exists())

@@ -1,20 +1,26 @@
 """Writes the files of the policies that ship with xreset: ci/ship_policies.py [NAME=RUN ...]
 
 Without arguments it writes the deployed graphs anew, which is needed after the code of observations or actions has
-changed. NAME=RUN adds the policy of a run with its graph, or replaces them; large weights are stored in half precision.
-Measure the file that ships, and write its card. Graphs have the contract of the training that the policy's own file states.
+changed. NAME=RUN adds the policy of a run with its graph and its newest checkpoint, or replaces them; large weights are
+stored in half precision. Measure the file that ships, and write its card. Graphs have the contract of the training that the policy's own file states.
 """
 
 from __future__ import annotations
 
+import io
 import json
 import sys
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import onnx
+import torch
 from onnx import helper, numpy_helper
 
 from xreset.eval.policy_spec import load_policy
+from xreset.learning.checkpoint import read_checkpoint
+from xreset.learning.run import latest_checkpoint
 from xreset.live.deploy import deployed_graph, with_metadata
 from xreset.policy.onnx_policy import METADATA_KEY, VERSION_KEY
 from xreset.policy.shipped import FOLDER, shipped
@@ -43,6 +49,32 @@ def halved(content: bytes) -> bytes:
     return model.SerializeToString()
 
 
+def halved_checkpoint(run: Path) -> bytes:
+    """Return the newest checkpoint of a run with what another training starts from, its large weights in half
+    precision."""
+    content = read_checkpoint(latest_checkpoint(run))
+    content = replace(
+        content,
+        actor_state_dict=halved_state(content.actor_state_dict),
+        critic_state_dict=halved_state(content.critic_state_dict),
+        optimizer_state_dict={"state": {}},
+        average_state_dict={},
+        resets_state_dict={},
+    )
+    buffer = io.BytesIO()
+    torch.save(vars(content), buffer)
+    return buffer.getvalue()
+
+
+def halved_state(state: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """Return the state of a network with its large weights in half precision."""
+    halved = {}
+    for name, value in state.items():
+        # a clone, because an LSTM's weights lie in one storage, which would be written whole
+        halved[name] = value.half() if value.nbytes >= LARGE else value.clone()
+    return halved
+
+
 def without_weights(graph: bytes, network: bytes) -> bytes:
     """Return a graph without the weights that are in its network's file too, as
     :func:`xreset.policy.shipped.shipped_graphs` describes it."""
@@ -67,6 +99,7 @@ def main() -> None:
     for argument in sys.argv[1:]:
         name, _, run = argument.partition("=")
         (FOLDER / f"{name}.onnx").write_bytes(halved(load_policy(run).exported()))
+        (FOLDER / f"{name}.pt").write_bytes(halved_checkpoint(Path(run)))
         made.add(name)
     for name, file in shipped().items():
         policy = load_policy(file)

@@ -24,6 +24,7 @@ from numpy.testing import assert_array_equal
 from onnx import numpy_helper
 from torch.testing import assert_close
 
+from ci import ship_policies
 from tests.command import calls_of, refused, succeeds
 from tests.data import refuses
 from tests.toy_bank import SOUP, SPAM, toy_bank
@@ -47,7 +48,6 @@ from xreset.learning.checkpoint import load_moments, read_checkpoint
 from xreset.learning.config import ScheduleConfig, TrainConfig
 from xreset.learning.export import exported
 from xreset.learning.exported import read_policy
-from xreset.learning.from_onnx import network_of
 from xreset.learning.recipes import RECIPES, own_terms_flags, starting_config
 from xreset.learning.run import (
     checkpoints,
@@ -573,34 +573,26 @@ class TrainingTest(WithBank):
         self.assertEqual(content.actor_state_dict[count], before.actor_state_dict[count])
         self.assertEqual(content.critic_state_dict[count], seen + 8 * 4)
 
-    def test_a_policy_learns_on(self):
-        """Its actor stays as it is until the new critic has learned, also after a kill."""
-        policy = self.out / "policy.onnx"
-        given = network_of(OnnxPolicy(policy)).state_dict()
-        ppo = replace(CONFIG.ppo, average=0.08)
-        config = replace(starting_config(str(policy)), ppo=ppo, iterations=1, save_interval=1)
+    def test_a_policy_that_ships_learns_on_from_its_checkpoint(self):
+        self.enterContext(patch("xreset.policy.shipped.FOLDER", self.folder))
+        shutil.copy(self.out / "policy.onnx", self.folder / "skilled.onnx")
+        config = replace(starting_config("skilled"), iterations=1)
         self.assertEqual(config.task, CONFIG.task)
-        with patch("xreset.learning.train.CRITIC_ITERATIONS", 2):
-            out = self.train("on", config=config, weights=policy)
-            before = newest(out)
-            self.resume(out, iterations=2)
-            self.resume(out, iterations=3)  # from where the actor begins to learn
-        info = read_run(out)
-        self.assertEqual((info.weights, info.weights_hash), (str(policy), file_hash(policy)))
-        first, second, third = map(read_checkpoint, checkpoints(out))
-        networks = [content.actor_state_dict for content in (first, second, third)]
-        moving = [name for name in given if name.endswith(("weight", "bias"))]
-        for name in moving:
-            assert_close(networks[1][name], given[name])
-        self.assertFalse(any(torch.equal(networks[2][name], given[name]) for name in moving))
-        for name in given:
-            if "normalizer" in name:
-                assert_close(networks[2][name], given[name], msg=name)
-        name = "mlp.0.weight"
-        critics = [content.critic_state_dict[name] for content in (first, second)]
-        self.assertFalse(torch.equal(*critics))
-        self.assertLess(third.learning_rate, CONFIG.ppo.learning_rate / 10)
-        assert_close(before.average_state_dict[name], given[name])
+        options = {"config": config, "weights": "skilled"}
+        self.assertRaisesRegex(PolicyError, "skilled holds no critic", self.train, "on", **options)
+        file = self.folder / "skilled.pt"
+        with patch.object(ship_policies, "LARGE", 0):
+            file.write_bytes(ship_policies.halved_checkpoint(self.out))
+        with patch("torch.optim.Adam.step"):  # the networks stay as they are
+            content = newest(self.train("on", **options))
+        info = read_run(self.folder / "on")
+        self.assertEqual((info.weights, info.weights_hash), (str(file), file_hash(file)))
+        before = newest(self.out)
+        for networks in ("actor_state_dict", "critic_state_dict"):
+            for name, value in getattr(before, networks).items():
+                if "normalizer" not in name:
+                    found = getattr(content, networks)[name]
+                    assert_close(found, value, rtol=1e-3, atol=1e-4, msg=name)
 
     def test_the_policy_has_the_running_mean_of_the_weights(self):
         self.assertFalse(newest(self.out).average_state_dict, "no mean was asked for")
@@ -717,10 +709,7 @@ class TrainingTest(WithBank):
             (r"layout .*--recipe .*run$", {"weights": self.out, "config": short}),
             ("policy of the robot 'ur7e-sharpa', not of 'openarm'", {"weights": "many-objects"}),
             ("sees through cameras", {"weights": "many-objects-camera", "config": None}),
-            (
-                r"{'lstm': 12}, .*{'lstm': 16}",
-                {"weights": self.out / "policy.onnx", "config": wide},
-            ),
+            ("onnx holds no critic.*Give the folder", {"weights": self.out / "policy.onnx"}),
             ("000002.pt is a file. Give the folder", {"weights": latest_checkpoint(self.out)}),
             (f"folder above has one: give {self.out}", {"weights": self.out / "checkpoints"}),
             ("this training has no teacher", {"config": idle}),

@@ -61,7 +61,7 @@ def run(
         engine: physics engine to evaluate in, or several; default: all that can be used here.
         recipe: recipe of the training, or another run's folder; default: the recipe of the headline results, or that
             of the weights.
-        weights: policy or run with which the training starts, as in xreset train.
+        weights: run with whose networks the training starts, or many-objects, as in xreset train.
         device: where to train: cpu or cuda; default: cuda where there is a GPU.
         num_envs: worlds of the training.
         minutes: time of the whole training, without compiling kernels; default: 25, unless iterations are given.

@@ -1,4 +1,4 @@
-"""The network of an exported policy, which teaches a student or learns on: the file holds all weights."""
+"""The network of an exported policy, which teaches a student: the file holds all weights."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from xreset.errors import PolicyError
-from xreset.learning.config import ModelConfig
+from xreset.learning.config import MODEL, ModelConfig
 from xreset.learning.model import PointNetLstmModel
 from xreset.policy.onnx_policy import OnnxPolicy, observation_shapes
 
@@ -75,6 +75,7 @@ def _layers(weights: dict[str, Tensor]) -> ModelConfig:
         pointnet=_widths(weights, "trunk.pointnet.mlp."),
         lstm=weights["trunk.lstm.weight_hh_l0"].shape[1],
         mlp=_widths(weights, "mlp.")[:-1],
+        initial_std=MODEL.initial_std,
     )
 
 

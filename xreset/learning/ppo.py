@@ -58,7 +58,6 @@ class SequencePpo(PPO):
 
     Attributes:
         networks: name -> network that a checkpoint holds.
-        critic_only: whether the actor stays as it is.
     """
 
     def __init__(
@@ -93,7 +92,6 @@ class SequencePpo(PPO):
         )
         self.networks = {"actor": actor, "critic": critic}
         self.processes = processes
-        self.critic_only = False
         self.sequence_length = p.sequence_length
         self.bounds_loss = p.bounds_loss
         on_gpu = device.startswith("cuda")
@@ -142,7 +140,6 @@ class SequencePpo(PPO):
         self._rate.fill_(self.learning_rate)
         self._use_rate()
         self._sums.zero_()
-        learn = self._learn_values if self.critic_only else self._learn_from_minibatch
         orders = [
             torch.randperm(storage.num_envs, device=self.device)
             for _ in range(self.num_learning_epochs)
@@ -153,7 +150,7 @@ class SequencePpo(PPO):
                     self._worlds.copy_(worlds)
                 else:
                     self._worlds = worlds
-                self._graphs.run(learn)
+                self._graphs.run(self._learn_from_minibatch)
         observations = storage.observations.flatten(0, 1)
         self.actor.update_normalization(observations)
         self.critic.update_normalization(observations)
@@ -180,23 +177,12 @@ class SequencePpo(PPO):
         clipped = ratio.clamp(1.0 - self.clip_param, 1.0 + self.clip_param)
         surrogate = torch.max(-advantages * ratio, -advantages * clipped).mean()
         excess = (self.actor.output_mean.abs() - BOUND).clamp_min(0.0).square().sum(dim=-1).mean()
-        self._descend(
+        loss = (
             surrogate
             + self.value_loss_coef * value
             - self.entropy_coef * entropy
             + self.bounds_loss * excess
         )
-        self._sums += torch.stack((value, surrogate, entropy, excess)).detach()
-
-    def _learn_values(self) -> None:
-        """Like :meth:`_learn_from_minibatch`, for the critic alone."""
-        observations = self.storage.observations[:, self._worlds]
-        value = self._value_loss(observations, first_steps(self.storage, self._worlds))
-        self._descend(self.value_loss_coef * value)
-        self._sums[0] += value.detach()
-
-    def _descend(self, loss: Tensor) -> None:
-        """Take one step of the optimizer."""
         self.optimizer.zero_grad()
         loss.backward()
         if self.is_multi_gpu:
@@ -204,13 +190,11 @@ class SequencePpo(PPO):
         for model in (self.actor, self.critic):
             torch.nn.utils.clip_grad_norm_(model.parameters(), self.max_grad_norm)
         self.optimizer.step()
+        self._sums += torch.stack((value, surrogate, entropy, excess)).detach()
 
     def _value_loss(self, observations: TensorDict, first: Tensor) -> Tensor:
         """Return the mean squared error of the values of the minibatch of ``_worlds``, in units of the returns'
-        deviation if the critic knows it.
-
-        A critic that learns alone is new, and far from the returns: its values are not held near the old ones.
-        """
+        deviation if the critic knows it."""
         storage = self.storage
         worlds = self._worlds
         state = piece_states(storage.saved_hidden_state_c, worlds, self.sequence_length)
@@ -219,8 +203,6 @@ class SequencePpo(PPO):
         returns = storage.returns[:, worlds]
         unit = self.critic.return_std if isinstance(self.critic, ReturnCritic) else 1.0
         error = (values - returns) / unit
-        if self.critic_only:
-            return error.square().mean()
         near = old_values + unit * ((values - old_values) / unit).clamp(
             -self.clip_param, self.clip_param
         )

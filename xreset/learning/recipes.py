@@ -148,10 +148,6 @@ def is_policy(name: str) -> bool:
     return name.endswith(".onnx") or (not Path(name).exists() and shipped_name(name) is not None)
 
 
-_STD = 0.15
-"""Standard deviation of the actions with which a policy learns on: its file does not have that of its training."""
-
-
 def _config_of_policy(name: str) -> TrainConfig:
     """Return the default configuration with the task and the layers of a policy."""
     from xreset.learning.exported import read_policy
@@ -163,7 +159,7 @@ def _config_of_policy(name: str) -> TrainConfig:
         raise PolicyError(
             f"{name} sees through cameras. Give a policy that is told pose and shape, or train a student (--teacher)."
         )
-    return TrainConfig(task=task, model=replace(layers_of(policy), initial_std=_STD))
+    return TrainConfig(task=task, model=layers_of(policy))
 
 
 def from_home(config: TrainConfig) -> TrainConfig:

@@ -29,12 +29,10 @@ from xreset.learning.checkpoint import (
 from xreset.learning.config import TrainConfig, value_at
 from xreset.learning.distillation import SequenceDistillation
 from xreset.learning.distributed import Processes
-from xreset.learning.from_onnx import network_of
 from xreset.learning.log import TrainingLog
-from xreset.learning.ppo import SLOWEST, SequencePpo
+from xreset.learning.ppo import SequencePpo
 from xreset.learning.recipes import resume_command
 from xreset.physics.tensors import one_thread
-from xreset.policy.onnx_policy import OnnxPolicy
 
 MAX_FAULTY_SHARE = 1e-3
 """Largest share of world-steps that may break; the run ends beyond it."""
@@ -44,10 +42,6 @@ transitions 0.9, 1.1 and 1.3 times as fast on a free core, and waits in a busy l
 next to two busy processes on two cores is then slower by a third."""
 FAULT_WINDOW = 200
 """Iterations over which the share is taken. The first iterations may use the allowance of the whole window."""
-
-CRITIC_ITERATIONS = 200
-"""Iterations in which the new critic of a policy that learns on learns alone. With 30 of them the policy lost a third
-of what it knew (docs/lab-book.md, "A policy that learns on")."""
 
 
 class TrainingRunner:
@@ -59,7 +53,6 @@ class TrainingRunner:
         elapsed: time of all iterations [s].
         processes: this process among those that train together.
         alg: the algorithm, with its networks.
-        critic_iterations: number of iterations at the beginning in which only the critic learns.
     """
 
     def __init__(
@@ -99,7 +92,6 @@ class TrainingRunner:
         self.iteration = 0
         self.env_steps = 0
         self.elapsed = 0.0
-        self.critic_iterations = 0
         self._average = {}
         if config.ppo.average > 0:
             self._average = {name: value.clone() for name, value in self._actor_state().items()}
@@ -181,10 +173,6 @@ class TrainingRunner:
         schedule = self.config.schedule
         if schedule.teacher and isinstance(self.alg, SequenceDistillation):
             self.alg.teacher_share = value_at(schedule.teacher, progress)
-        if self.critic_iterations and isinstance(self.alg, SequencePpo):
-            self.alg.critic_only = self.iteration < self.critic_iterations
-            if self.iteration == self.critic_iterations:
-                self.alg.learning_rate = SLOWEST
 
     def _iterate(self, obs: TensorDict, log: TrainingLog | None) -> TensorDict:
         """Collect a rollout, learn from it and write the log; return the last observations."""
@@ -320,14 +308,6 @@ class TrainingRunner:
         """
         content = self._load(path)
         self.alg.learning_rate = content.learning_rate
-
-    def load_policy(self, policy: OnnxPolicy) -> None:
-        """Start with the actor of an exported policy. The critic is new, and learns alone in the first iterations."""
-        network = network_of(policy)
-        actor = self.alg.networks["actor"]
-        actor.load_state_dict(actor.state_dict() | network.state_dict())
-        for name, mean in self._average.items():
-            mean.copy_(actor.state_dict()[name])
 
     def _load(self, path: Path) -> Checkpoint:
         """Read a checkpoint, and load its networks."""

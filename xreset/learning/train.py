@@ -42,9 +42,10 @@ from xreset.learning.run import (
     training_left,
     write_run,
 )
-from xreset.learning.runner import CRITIC_ITERATIONS, TrainingRunner
+from xreset.learning.runner import TrainingRunner
 from xreset.physics.plugins import device_for, existing_device
 from xreset.policy.onnx_policy import OnnxPolicy, check_contract
+from xreset.policy.shipped import shipped_checkpoints, shipped_name
 from xreset.resets.bank import ResetBank, read_bank, write_bank
 from xreset.resets.goals import GoalSet, read_goals, with_goals, write_goals
 from xreset.resets.inputs import Inputs, load_inputs
@@ -251,16 +252,16 @@ def check_config(config: TrainConfig, inputs: Inputs, *, has_teacher: bool) -> N
 def networks_to_start_with(
     weights: str | Path, robots: Sequence[RobotSpec], config: TrainConfig
 ) -> tuple[Path, str]:
-    """Return the newest checkpoint of another run, or a policy, whose networks must be like those of this run; and the
-    hash of the file."""
+    """Return the newest checkpoint of another run, or that of a policy that ships, whose networks must be like those of
+    this run; and the hash of the file."""
     name = str(weights)
     if is_policy(name):
         policy = read_policy(name)
+        checkpoint = shipped_checkpoints().get(shipped_name(name) or "")
         contract = policy.contract
         theirs = layers_of(policy).layers
-        # a policy has no critic
+        # the file tells of the actor alone
         del theirs["critic_mlp"], theirs["normalize_returns"]
-        found = (policy.path, policy.hash)
     else:
         run = read_run(name)
         if run.teacher is not None:
@@ -271,7 +272,6 @@ def networks_to_start_with(
         contract = run.contract
         theirs = run.config.model.layers
         checkpoint = latest_checkpoint(Path(weights))
-        found = (checkpoint, file_hash(checkpoint))
     start = f"Start from its configuration, with recipe=... or --recipe {name}"
     for robot in robots:
         try:
@@ -288,7 +288,12 @@ def networks_to_start_with(
         raise RunError(
             f"The networks of {name} have the layers {theirs}, this run's {ours}. {start}"
         )
-    return found
+    if checkpoint is None:
+        raise PolicyError(
+            f"{name} holds no critic, without which a training loses what a policy knows. Give the folder of its run, "
+            f"or a policy that ships with a critic: {', '.join(shipped_checkpoints())}."
+        )
+    return checkpoint, file_hash(checkpoint)
 
 
 def read_teacher(name: str | Path, inputs: Inputs, config: TrainConfig) -> OnnxPolicy:
@@ -437,22 +442,13 @@ def run_training(
             env.vision.check_sees_objects()
         teacher = out / TEACHER if info.teacher else None
         runner = TrainingRunner(env, info.config, out, teacher=teacher, wandb=wandb)
-        learns_on = info.weights is not None and is_policy(info.weights)
         if newest is not None:
             runner.load_checkpoint(newest)
-        elif learns_on:
-            runner.load_policy(read_policy(str(info.weights)))
-            if processes.is_main:
-                print(
-                    f"{info.weights} has no critic: a new one learns alone in the first {CRITIC_ITERATIONS} iterations",
-                    flush=True,
-                )
         elif info.weights is not None:
             runner.load_networks(Path(info.weights))
         if info.weights is not None:
             # new observations leave its mean and variance as they are (docs/lab-book.md, "A policy that learns on")
             runner.alg.networks["actor"].trunk.normalizer.until = 0
-        runner.critic_iterations = CRITIC_ITERATIONS if learns_on else 0
         if processes.is_main:
             _write_start(out, info, runner.iteration, is_new=newest is None, resumed=resumed)
         stopped_by = runner.learn(info.total, minutes=info.minutes)

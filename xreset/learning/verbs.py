@@ -79,9 +79,9 @@ def train(
             Options --config.* change it; see them with xreset train --help-config [PART]. Reward terms of your own are
             not taken from a file or a run; name them again. Default: the recipe of the headline results; with weights,
             that of the weights.
-        weights: another run's folder: start with the networks of its newest checkpoint, including the standard
-            deviation of the actions and the learning rate. Or an exported policy (.onnx), or the name of one that ships
-            with xreset: it has no critic, so a new one learns alone in the first iterations.
+        weights: another run's folder: start with the networks of its newest checkpoint, actor and critic, including the
+            standard deviation of the actions and the learning rate. Or many-objects, a policy that ships with a
+            checkpoint.
         teacher: run folder, exported policy (.onnx), or name of a policy that ships with xreset: a student learns its
             actions, in its task, from what cameras show (DAgger). Options of the images: --teacher NAME
             --help-config task.vision.

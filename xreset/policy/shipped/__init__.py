@@ -1,5 +1,5 @@
 """Trained policies that ship with xreset: ``NAME.onnx`` in this folder, the card ``NAME.toml``, and the deployed graph
-without its weights, ``NAME.graph``.
+without its weights, ``NAME.graph``. With a checkpoint, ``NAME.pt``, a policy can learn on: it holds actor and critic.
 
 The command line knows such a policy as NAME. The name of a robot means the policy of the same name, or the one whose
 card states the robot as ``default_of``.
@@ -78,6 +78,11 @@ def shipped_graphs() -> dict[str, Path]:
     them. A line of JSON lists the cuts: where in the rest a piece was, and its offset and length in the policy's file.
     The rest follows."""
     return {file.stem: file for file in sorted(FOLDER.glob("*.graph"))}
+
+
+def shipped_checkpoints() -> dict[str, Path]:
+    """Name -> checkpoint of every such policy that can learn on, without its optimizer."""
+    return {file.stem: file for file in sorted(FOLDER.glob("*.pt"))}
 
 
 def graph_of(network: bytes) -> bytes | None:

@@ -74,6 +74,12 @@ class Run(InFolder, TestCase):
                 words = ("run", demos, "--engine mujoco --robot", robot, "--out", self.folder / "a")
                 said = xreset_command(*words)[1]
             self.assertEqual("of another robot are not known" not in said, is_known, said)
+            self.assertNotIn("--weights", said, "no policy of this robot learns on")
+        with patch.object(command, "_step", side_effect=KeyboardInterrupt):
+            said = xreset_command(
+                "run", demos, "--robot ur7e-sharpa --engine mujoco --out", own / "b"
+            )[1]
+        self.assertIn("--weights many-objects --minutes 7", said)
 
     def test_nothing_is_made_if_a_later_step_would_refuse(self):
         demos = self.folder / "soup.npz"

@@ -18,6 +18,7 @@ from xreset.files.storage import claim_folder, file_hash
 from xreset.files.text import quantity
 from xreset.learning.run import read_run
 from xreset.physics.plugins import Device, backend_class, robot_names
+from xreset.policy.shipped import shipped_checkpoints, shipped_name
 
 _MINUTES = 25.0
 """Length of the training where nothing else is said."""
@@ -107,6 +108,12 @@ def run(
         console.print(line)
     if str(robot) not in robot_names():
         console.print("These are times of robots that ship; those of another robot are not known.")
+    known = shipped_name(str(robot))
+    if recipe is None and weights is None and known in shipped_checkpoints():
+        console.print(
+            f"The training can start from what {known} knows. It is then shorter, and better with other motion: "
+            f"--weights {known} --minutes 7"
+        )
     motion = out / "motion.npz"
     bank = out / "resets.npz"
     _refuse_other_training(out, bank)

@@ -591,11 +591,15 @@ class FairnessTest(Compared):
         self.assertNotIn("another policy", self.compare("a"))
 
     def test_a_training_that_began_with_the_networks_of_another(self):
-        file = "runs/joint/checkpoints/000900.pt"
+        file = "joint/checkpoints/000900.pt (abababab)"
         self.run_and_results("new")
-        self.run_and_results("onwards", weights=file, weights_hash="ab" * 32)
-        text = self.compare("new", "onwards")
-        self.assertIn(f"onwards began with the networks of another training ({file}): ", text)
+        for seed, folder in enumerate(("/first", "/second machine")):
+            weights = f"{folder}/joint/checkpoints/000900.pt"
+            self.run_and_results(
+                f"onwards-{seed}", seed=seed, weights=weights, weights_hash="ab" * 32
+            )
+        text = self.compare("new", "onwards-0", "onwards-1")
+        self.assertIn(f"onwards-1 began with the networks of another training ({file}): ", text)
         self.assertIn(f" weights | new | {file} |", text)
 
 

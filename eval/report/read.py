@@ -393,6 +393,11 @@ def run_facts(run: dict[str, Any], file: Path) -> dict[str, str]:
         if isinstance(each, dict):
             robots.append(str(each.get("robot")))
             banks.append(_file_fact(str(each.get("resets")), str(each.get("resets_hash"))))
+    weights = "new"
+    if run.get("weights") is not None:
+        # RUN/checkpoints/NUMBER.pt, wherever RUN is
+        place = Path(*Path(run["weights"]).parts[-3:])
+        weights = f"{place} ({str(run.get('weights_hash'))[:8]})"
     teacher = "-"
     if run.get("teacher") is not None:
         copy = file.parent / TEACHER
@@ -402,7 +407,7 @@ def run_facts(run: dict[str, Any], file: Path) -> dict[str, str]:
         "objects": ", ".join(map(short_name, names or ())) or "-",
         "meshes": "stand-ins" if run.get("meshes") is None else "meshes",
         "bank": ", ".join(banks),
-        "weights": str(run.get("weights") or "new"),
+        "weights": weights,
         "teacher": teacher,
         "engine": f"{run.get('engine')} {run.get('engine_version')}",
         "device": run["device"].partition(":")[0],

@@ -709,6 +709,10 @@ class TrainingTest(WithBank):
             (r"layout .*--recipe .*run$", {"weights": self.out, "config": short}),
             ("policy of the robot 'ur7e-sharpa', not of 'openarm'", {"weights": "many-objects"}),
             ("sees through cameras", {"weights": "many-objects-camera", "config": None}),
+            (
+                r"{'lstm': 12}, .*{'lstm': 16}",
+                {"weights": self.out / "policy.onnx", "config": wide},
+            ),
             ("onnx holds no critic.*Give the folder", {"weights": self.out / "policy.onnx"}),
             ("000002.pt is a file. Give the folder", {"weights": latest_checkpoint(self.out)}),
             (f"folder above has one: give {self.out}", {"weights": self.out / "checkpoints"}),

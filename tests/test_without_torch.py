@@ -6,6 +6,7 @@ import sys
 from tests.data import InFolder
 from tests.toy_results import toy_result
 from xreset.eval.results import write_result
+from xreset.policy.shipped import shipped_graphs
 
 BLOCKED = """
 import sys
@@ -69,9 +70,10 @@ class WithoutTorchTest(InFolder):
 
     def test_commands_list_export_view_and_report(self):
         write_result(self.folder / "run" / "eval", toy_result(), [], ("a",))
+        names = shipped_graphs()
         commands = (
             "policies",
-            "export deploy openarm --out on_robot --object soup",
+            *map("export deploy {0} --out on_robot/{0} --object soup".format, names),
             "demos synth --objects soup --per-object 1 --out demos.npz",
             "view demos.npz --out demos.png",
             "report run --out page",
@@ -80,6 +82,7 @@ class WithoutTorchTest(InFolder):
         found = self.run_blocked(f"from xreset.cli import main\n{calls}{CAMERA}")
         self.assertIn("many-objects-camera: ", found)
         self.assertRegex(found, "refused: .*has cameras")
-        self.assertTrue((self.folder / "on_robot" / "policy.onnx").exists())
+        for name in names:
+            self.assertTrue((self.folder / "on_robot" / name / "policy.onnx").exists(), name)
         self.assertIn("page: page", found)
         self.assertTrue((self.folder / "page" / "index.html").exists())

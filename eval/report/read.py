@@ -396,8 +396,7 @@ def run_facts(run: dict[str, Any], file: Path) -> dict[str, str]:
     weights = "new"
     if run.get("weights") is not None:
         # RUN/checkpoints/NUMBER.pt, wherever RUN is
-        place = Path(*Path(run["weights"]).parts[-3:])
-        weights = f"{place} ({str(run.get('weights_hash'))[:8]})"
+        weights = _file_fact(str(run["weights"]), str(run.get("weights_hash")), parts=3)
     teacher = "-"
     if run.get("teacher") is not None:
         copy = file.parent / TEACHER
@@ -418,5 +417,5 @@ def run_facts(run: dict[str, Any], file: Path) -> dict[str, str]:
     }
 
 
-def _file_fact(path: str, hash_: str) -> str:
-    return f"{Path(path).name} ({hash_[:8]})"
+def _file_fact(path: str, hash_: str, *, parts: int = 1) -> str:
+    return f"{Path(*Path(path).parts[-parts:])} ({hash_[:8]})"

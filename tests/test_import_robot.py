@@ -351,6 +351,9 @@ class Toy(Robots):
         limited = '<joint name="f1_1" actuatorfrcrange="-0.5 0.5"'
         text = MJCF.replace('<joint name="f1_1"', limited, 1)
         self.assertEqual(self.read("limited.xml", text)[0].joint("f1_1").effort, 0.5)
+        pulling = '<motor joint="f1_1" ctrlrange="-9 0"/></actuator>'
+        text = MJCF.replace("</actuator>", pulling)
+        self.assertEqual(self.read("pulling.xml", text)[0].joint("f1_1").effort, 9.0)
 
     def test_an_actuator_of_a_floating_base_is_left_out(self):
         text = MJCF.replace('<body name="base">', '<body name="base"><freejoint name="float"/>', 1)

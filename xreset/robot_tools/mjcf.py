@@ -94,11 +94,11 @@ def read_mjcf(path: Path, notes: list[str]) -> RobotTree:
         kp = -float(model.actuator_biasprm[actuator, 1])
         limit = 0.0
         if model.actuator_forcelimited[actuator]:
-            limit = lever * float(model.actuator_forcerange[actuator, 1])
+            limit = lever * _farthest(model.actuator_forcerange[actuator])
         elif kp == 0 and model.actuator_ctrllimited[actuator]:  # a motor: its control is a force
-            limit = abs(gain) * lever * float(model.actuator_ctrlrange[actuator, 1])
+            limit = abs(gain) * lever * _farthest(model.actuator_ctrlrange[actuator])
         if model.jnt_actfrclimited[joint]:
-            most = float(model.jnt_actfrcrange[joint, 1])
+            most = _farthest(model.jnt_actfrcrange[joint])
             limit = min(limit, most) if limit > 0 else most
         name = joint_name(model, joint)
         stated = {"effort": max(limit, joints[name].effort)}
@@ -121,7 +121,12 @@ def _refuse(path: Path, problems: list[str]) -> None:
 def _farthest_turn(model: mujoco.MjModel) -> float:
     """Return the largest limit of two or more hinges [rad]; 0 if there are fewer."""
     turns = model.jnt_limited.astype(bool) & (model.jnt_type > SLIDE)
-    return float(np.abs(model.jnt_range[turns]).max()) if turns.sum() > 1 else 0.0
+    return _farthest(model.jnt_range[turns]) if turns.sum() > 1 else 0.0
+
+
+def _farthest(ranges: np.ndarray) -> float:
+    """Return the limit farthest from 0: what only pulls has a range such as -5 to 0."""
+    return float(np.abs(ranges).max())
 
 
 def _compiled(path: Path, unit: str = "") -> mujoco.MjModel:

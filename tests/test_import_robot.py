@@ -727,6 +727,8 @@ class Toy(Robots):
             made = make_robot(None, self.file(f"{name}.urdf", urdf), self.folder / name)
             spec = load_robot(made.folder)
             self.assertEqual(len(spec.arm_indices), 7)
+            # a target 2 cm inside of an object must press, although no stiffness is stated
+            self.assertGreater(spec.joints[-1].drive.kp * 0.02, 10.0)
             at_start = spec.home[spec.hand_indices]
             ends = Kinematics(spec).upper.numpy()[spec.hand_indices]
             assert_allclose(at_start, 0.85 * ends, atol=1e-3, err_msg="the jaw is open at home")

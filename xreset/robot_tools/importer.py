@@ -47,8 +47,13 @@ for a step of 1/240 s. The inertia of a link means the same in every engine, whi
 robots)."""
 _ROTORS = (1e-6, 0.05)
 """[kg m^2] Rotor inertias of a hand that are believed."""
-_EFFORT = {"hand": 1.0, "arm": 50.0}
-"""[N m] Effort limits of joints without a stated one."""
+_EFFORT = {
+    ("hand", "revolute"): 1.0,
+    ("hand", "prismatic"): 20.0,
+    ("arm", "revolute"): 50.0,
+    ("arm", "prismatic"): 500.0,
+}
+"""[N m or N] Effort limits of joints without a stated one."""
 _EFFORTS = {
     ("hand", "revolute"): (0.01, 50.0),
     ("hand", "prismatic"): (0.5, 1000.0),
@@ -56,6 +61,8 @@ _EFFORTS = {
     ("arm", "prismatic"): (20.0, 30_000.0),
 }
 """[N m or N] Effort limits that are believed."""
+_SLIDE = 0.02
+"""[m] Way of a sliding joint's target beyond the joint that asks for its whole effort."""
 _STABLE = {"hand": 0.8, "arm": 0.3}
 """Share of the largest kp that is stable in engines that integrate drives explicitly: kd times the step stays below the
 inertia. With stiffer arms, MuJoCo's steps differ from finer ones by more than its check allows."""
@@ -344,9 +351,9 @@ def _with_efforts(tree: RobotTree, hand_root: str, notes: list[str]) -> RobotTre
                 without.append(joint.name)
             elif not least <= joint.effort <= most:
                 wrong.append(f"{joint.name} ({joint.effort:g})")
-                joint = replace(joint, effort=_EFFORT[group])
+                joint = replace(joint, effort=_EFFORT[group, joint.type])
         joints.append(joint)
-    rule = f"they get {_EFFORT['arm']:g} (arm) or {_EFFORT['hand']:g} N m (hand)"
+    rule = "they get 50 N m (arm) or 1 N m (hand); slides 500 N or 20 N"
     if without:
         notes.append(f"no effort is stated for {listed(without)}; {rule}")
     if wrong:
@@ -397,19 +404,21 @@ def _with_free_spread(spec: RobotSpec, notes: list[str]) -> RobotSpec:
 def _with_drives(spec: RobotSpec, tree: RobotTree, notes: list[str]) -> RobotSpec:
     """Return the robot with drives as the files state them, else by the built-in robots' rule.
 
-    The rule: stiff enough that the effort is reached within 0.35 rad, and not too stiff for the step of the engines.
+    The rule: stiff enough that the effort is reached within 0.35 rad or 2 cm, and not too stiff for the step of the
+    engines.
     """
     joints = []
     softer = []
     for joint, inertia in zip(spec.joints, drive_inertia(spec, spec.home), strict=True):
         stated = tree.joint(joint.name)
-        effort = stated.effort or _EFFORT[joint.group]
-        if joint.group == "arm":
+        effort = stated.effort or _EFFORT[joint.group, stated.type]
+        factor = 2.0 if joint.group == "arm" else 1.8
+        if stated.type == "prismatic":
+            kp = effort / _SLIDE
+        elif joint.group == "arm":
             kp = float(np.clip(effort * 15, 300, 2000))
-            factor = 2.0
         else:
             kp = float(np.clip(effort / 0.35, 0.5, 10))
-            factor = 1.8
         stable = float(f"{_STABLE[joint.group] * inertia / (factor * SceneSpec.timestep) ** 2:.3g}")
         if joint.group == "hand" and stated.stiffness > stable:
             softer.append(f"{joint.name} ({stated.stiffness:g})")

@@ -277,7 +277,7 @@ class WritePlacementTest(InFolder):
             after = load(self.folder)
             best = self.best.robot
             self.assertEqual((after.base_pos, after.base_quat), (best.base_pos, best.base_quat))
-            assert_allclose(after.home, best.home, atol=1e-3)
+            assert_allclose(after.home, best.home, atol=1e-7)
         line = '# Placement: reaches 91.2 % and follows 87.6 % of 321 frames: xreset robots place openarm --demos "my demos.npz"'
         self.assertEqual(self.lines(True), [line])
         for joint, before in zip(after.joints, self.robot.joints, strict=True):

@@ -77,7 +77,7 @@ def write_placement(path: Path, robot: RobotSpec, best: Finalist, command: str) 
         for joint in best.robot.joints:
             if joint.group == "arm":
                 pattern = rf'name *= *"{re.escape(joint.name)}".*?\bhome *= *([-+.\deE]+)'
-                edits.append((pattern, f"{joint.home:.3f}"))
+                edits.append((pattern, f"{joint.home:.8g}"))
     text = re.sub(r"^(# Placement:|placement *=).*\n", "", path.read_text(), flags=re.MULTILINE)
     for pattern, new in edits:
         match = re.search(pattern, text, flags=re.MULTILINE)

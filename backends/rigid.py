@@ -21,7 +21,7 @@ from xreset.files.checks import frozen
 from xreset.geometry.dynamics import drive_shares, drive_values
 from xreset.geometry.kinematics import on_host
 from xreset.geometry.shapes import pose_matrix, shape_mesh, transformed
-from xreset.geometry.urdf import Joint, Link, robot_tree
+from xreset.geometry.urdf import Joint, Link, RobotTree, robot_tree
 from xreset.spec import ObjectSpec, RobotSpec, Shape
 
 StateArrays = Mapping[str, np.ndarray]
@@ -109,6 +109,7 @@ class Mechanism:
     """The bodies of a robot, the base first and parents before children. Joint i moves body i + 1."""
 
     robot: RobotSpec
+    tree: RobotTree
     bodies: tuple[Body, ...]
     frames: Frames
 
@@ -145,13 +146,9 @@ class Mechanism:
         excluded pairs.
         """
         robot = self.robot
-        if not {a, b} <= set(robot.self_collision_links):
-            return False
-        if (a, b) in robot.collision_exclude or (b, a) in robot.collision_exclude:
-            return False
-        i = self.frames[a][0]
-        j = self.frames[b][0]
-        return i != j and self.bodies[i].parent != j and self.bodies[j].parent != i
+        listed = {a, b} <= set(robot.self_collision_links)
+        excluded = {(a, b), (b, a)} & set(robot.collision_exclude)
+        return listed and not excluded and self.tree.may_meet(a, b)
 
 
 def vertices(shape: Shape) -> np.ndarray:
@@ -206,7 +203,7 @@ def mechanism(robot: RobotSpec) -> Mechanism:
             shapes=tuple(shapes),
         )
         bodies.append(body)
-    return Mechanism(robot=robot, bodies=tuple(bodies), frames=frames)
+    return Mechanism(robot=robot, tree=tree, bodies=tuple(bodies), frames=frames)
 
 
 class TrackedFrames:

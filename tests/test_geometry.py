@@ -261,6 +261,10 @@ class SelfCollisionTest(TestCase):
     def test_pairs_that_the_arm_moves_join_hand_and_arm(self):
         collision = SelfCollision(Kinematics(self.robot), moved_by_arm=True)
         self.assertIn(("forearm_link", "right_index_DP"), collision.link_pairs)
+        # the wrist is fixed to the palm, which is excluded with the thumb
+        pairs = SelfCollision(Kinematics(self.robot)).link_pairs
+        self.assertNotIn(("right_hand_C_MC", "right_thumb_MC"), pairs)
+        self.assertIn(("wrist_3_link", "right_thumb_MC"), pairs)
         self.assertNotIn(("right_index_DP", "right_middle_DP"), collision.link_pairs)
 
     def test_one_link_is_kept_out_of_another(self):

@@ -22,7 +22,6 @@ from xreset.files.checks import frozen
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import matvec, quat_to_matrix
 from xreset.geometry.shapes import transformed
-from xreset.geometry.urdf import RobotTree
 from xreset.physics.tensors import Tensors, one_thread
 from xreset.spec import Geometry, ObjectSpec, RobotSpec, Shape, TableSpec
 
@@ -176,8 +175,11 @@ class SelfCollision:
         self._shapes = _LinkShapes(kinematics, kinematics.link_names if only is None else only)
         robot = kinematics.robot
         tree = kinematics.tree
-        pairs = combinations(dict.fromkeys(self._shapes.link), 2)
-        counted = [pair for pair in pairs if _may_collide(robot, tree, *pair)]
+        excluded = set(map(frozenset, robot.collision_exclude))
+        counted = []
+        for pair in combinations(dict.fromkeys(self._shapes.link), 2):
+            if tree.may_meet(*pair) and frozenset(pair) not in excluded:
+                counted.append(pair)
         if moved_by_arm:
             arm = [robot.joint_names[i] for i in robot.arm_indices]
             moved = [tree.below(tree.joint(name).child) for name in arm]
@@ -236,20 +238,6 @@ class SelfCollision:
         for (configuration, _, _), distance in self.near(link_poses, 0.0).items():
             clearance[configuration] = min(clearance[configuration], distance)
         return clearance
-
-
-def _may_collide(robot: RobotSpec, tree: RobotTree, a: str, b: str) -> bool:
-    """Return whether two links are on bodies that are neither neighbors nor an excluded pair."""
-    bodies = {tree.moving_ancestor(a), tree.moving_ancestor(b)}
-    joints = [tree.moved_by[body] for body in bodies if body in tree.moved_by]
-    parents = {tree.moving_ancestor(joint.parent) for joint in joints}
-    if len(bodies) == 1 or bodies & parents:
-        return False
-    excluded = [
-        {tree.moving_ancestor(one), tree.moving_ancestor(other)}
-        for one, other in robot.collision_exclude
-    ]
-    return bodies not in excluded
 
 
 @frozen

@@ -159,6 +159,13 @@ class RobotTree:
             name = self.above[name].parent
         return name
 
+    def may_meet(self, a: str, b: str) -> bool:
+        """Return whether two links are of different rigid bodies that no joint connects."""
+        bodies = {self.moving_ancestor(a), self.moving_ancestor(b)}
+        joints = [self.moved_by[body] for body in bodies if body in self.moved_by]
+        parents = {self.moving_ancestor(joint.parent) for joint in joints}
+        return len(bodies) == 2 and not bodies & parents
+
     def pose_in(self, link: str, name: str) -> np.ndarray:
         """[4, 4] pose of a link in the frame of another one that carries it, with all joints at 0."""
         T = np.eye(4)

@@ -415,6 +415,12 @@ class OwnPageOnly(WithFiles):
         with connect(f"ws://{address}", origin=f"http://{address}"):
             pass
 
+    def test_the_address_of_a_page(self):
+        page = WebPage.__new__(WebPage)
+        for host, expected in (("0.0.0.0", "localhost"), ("::1", "[::1]"), ("::", "[::1]")):
+            page._server = mock.Mock(**{"get_host.return_value": host, "get_port.return_value": 80})
+            self.assertEqual(page.url, f"http://{expected}:80")
+
     def test_a_port_that_no_machine_has(self):
         with (
             mock.patch("viser.ViserServer") as server,

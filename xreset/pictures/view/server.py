@@ -94,6 +94,8 @@ class WebPage:
         host = self._server.get_host()
         if host in ("0.0.0.0", "127.0.0.1"):
             host = "localhost"
+        elif ":" in host:
+            host = "[::1]" if host == "::" else f"[{host}]"
         return f"http://{host}:{self._server.get_port()}"
 
     def serve(self) -> None:

@@ -224,7 +224,7 @@ def scene_of(name: str, policy: PolicySpec) -> tuple[SceneSpec, dict[str, Any]]:
     session = Session(policy, object_name=name)
     session.close()
     content = physics_part(session.scene, 0)
-    content["object"] = object_part(session.scene.objects[0], len(session.cloud()))
+    content["object"] = object_part(session.scene.objects[0], len(session.points))
     content["starts"] = starts_of(session.bank)
     return session.scene, content
 

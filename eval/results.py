@@ -326,10 +326,8 @@ def write_result(
     (folder / f"{name}.episodes.json").unlink(missing_ok=True)  # of an earlier version
 
 
-def write_traces(
-    path: Path, traces: Sequence[Trace], joint_names: tuple[str, ...], **others: Any
-) -> None:
-    """Write recorded episodes; ``others``: further arrays, which :func:`read_traces` ignores."""
+def write_traces(path: Path, traces: Sequence[Trace], joint_names: tuple[str, ...]) -> None:
+    """Write recorded episodes."""
     arrays = {
         "time": traces[0].time,
         "joint_names": np.array(joint_names),
@@ -341,7 +339,7 @@ def write_traces(
     targets = [t.joint_target for t in traces if t.joint_target is not None]
     if len(targets) == len(traces):
         arrays["joint_target"] = np.stack(targets)
-    write_npz(path, TRACE_SCHEMA, arrays | others)
+    write_npz(path, TRACE_SCHEMA, arrays)
 
 
 def read_evaluation(folder: Path) -> Evaluation:

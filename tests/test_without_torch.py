@@ -20,7 +20,7 @@ sys.meta_path.insert(0, NoTorch())
 """
 PLAY = """
 import numpy as np
-from xreset.eval.play.record import write_film, write_trace
+from xreset.eval.play.record import write_film
 from xreset.eval.play.session import Session
 
 session = Session("many-objects", object_name="mustard")
@@ -41,7 +41,6 @@ session.choose_policy("zero", robot="openarm")
 for _ in range(3):
     still = session.step()
 assert np.ptp([m.joint_target for m in session.history], axis=0).max() == 0
-write_trace("play.trace.npz", session)
 write_film("play.mp4", session, seconds=0.1)
 """
 CAMERA = """

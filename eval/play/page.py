@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import partial
@@ -16,13 +15,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from xreset.errors import XResetError
-from xreset.eval.play.record import draw_film, last_moments, write_trace
+from xreset.eval.play.record import draw_film, last_moments
 from xreset.eval.play.session import RESTS, Session
-from xreset.eval.plots import COLORS
 from xreset.files.text import short_name
 from xreset.physics.plugins import backend_names, robot_names
 from xreset.pictures.meshes import GOAL_COLOR, OBJECT_COLOR, rgb
-from xreset.pictures.view.colors import TOUCH_COLOR
 from xreset.pictures.view.server import (
     RobotMeshes,
     WebPage,
@@ -43,11 +40,8 @@ PHONE_STYLE = """<style>@media (max-width: 36em) {
 """On a phone, the controls leave the upper half to the robot."""
 FRAME = 1 / 30
 """Time between two pictures [s]."""
-CURVE_FRAME = 0.25
-"""Time between two updates of text and curves [s]."""
-CURVE_SECONDS = 10.0
-CURVE_POINTS = 120
-"""Most points of a curve."""
+TEXT_FRAME = 0.25
+"""Time between two updates of the text [s]."""
 LOOK_AT = np.array((0.57, 0.3, 0.3))
 """Middle of what happens [m]."""
 RIGHT = np.array((0.79, 0.61, 0.0))
@@ -221,16 +215,9 @@ class Page(WebPage):
             "/handle/hint", "drag me", position=(0.0, 0.0, 0.02), anchor="bottom-center"
         )
         self._beside = 1.8 * radius * RIGHT
-        self._points = scene.add_point_cloud(
-            "/points",
-            np.zeros((1, 3), np.float32),
-            rgb(TOUCH_COLOR),
-            point_size=0.006,
-            visible=False,
-        )
         self._robot = RobotMeshes(scene, session.policy.robot)
         links = self._robot.links
-        self._things = [self._hint, self._handle, self._rings, self._goal, self._body, self._points]
+        self._things = [self._hint, self._handle, self._rings, self._goal, self._body]
         self._things += links.values()
         self._rings.on_update(self._turn)
         for part in (self._goal, self._handle):
@@ -281,10 +268,8 @@ class Page(WebPage):
             if not self._turning:
                 self._rings.position = self._goal.position
                 self._rings.wxyz = self._goal.wxyz
-            if self._see.value:
-                self._points.points = session.cloud().astype(np.float32)
         self._drawn = time.monotonic()
-        if self._drawn - self._written > CURVE_FRAME:
+        if self._drawn - self._written > TEXT_FRAME:
             self._write()
 
     # The controls -----------------------------------------------------------------------------------------------------
@@ -316,18 +301,10 @@ class Page(WebPage):
             self._policy = gui.add_dropdown("policy", tuple(self._policies))
             names = dict.fromkeys((self.session.policy.robot.name, *robot_names()))
             self._robot_name = gui.add_dropdown("robot", tuple(names))
-        with gui.add_folder("curves", expand_by_default=False) as folder:
-            self._see = gui.add_checkbox("the object's points that the policy sees", False, order=0)
-            self._see.on_update(lambda _: setattr(self._points, "visible", self._see.value))
-            self._input = gui.add_dropdown("input", tuple(self.session.inputs) or ("",), order=2)
-            self._forces = _Curves(gui, folder, "fingertip forces [N]", 1)
-            self._inputs = _Curves(gui, folder, "this input of the policy", 3, legend=False)
         with gui.add_folder("save", expand_by_default=False):
             self._seconds = gui.add_slider("seconds", 2, 60, 1, 10)
             film = gui.add_button("Film (mp4)")
             film.on_click(lambda event: self._enqueue(self._save_film, event.client))
-            trace = gui.add_button("Numbers (npz)")
-            trace.on_click(lambda event: self._enqueue(self._save_trace, event.client))
         self._show_choices()
         for control in (self._object, self._engine, self._policy, self._robot_name):
             control.on_update(lambda _: self._enqueue(self._open_chosen))
@@ -341,9 +318,6 @@ class Page(WebPage):
         self._engine.value = session.engine
         self._policy.value = session.policy.name
         self._robot_name.value = session.policy.robot.name
-        inputs = tuple(session.inputs) or ("",)
-        if self._input.options != inputs:
-            self._input.options = inputs
 
     def _press(self, button: str) -> None:
         if button == "Restart":
@@ -393,7 +367,7 @@ class Page(WebPage):
         return name if name in self._policies else RESTS
 
     def _write(self) -> None:
-        """Show text and curves."""
+        """Show what the text and the buttons say."""
         session = self.session
         now = time.monotonic()
         wall = now - self._clock[0]
@@ -404,22 +378,8 @@ class Page(WebPage):
             "Put the object back" if session.away or session.lost else "Take the object away"
         )
         self._written = now
-        if not session.history:
-            return
-        self._text.content = as_html(*self._status())
-        begin = session.history[-1].time - CURVE_SECONDS
-        moments = [moment for moment in session.history if moment.time > begin]
-        moments = moments[:: max(1, len(moments) // CURVE_POINTS)]
-        times = np.array([moment.time for moment in moments])
-        forces = np.array([np.linalg.norm(moment.tip_force, axis=1) for moment in moments])
-        self._forces.show(times, forces, session.policy.robot.fingertip_names)
-        if not session.inputs:
-            return
-        name = chosen(self._input, self._input.options[0])
-        shown = session.inputs[name]
-        inputs = np.array([moment.inputs[shown] for moment in moments])
-        columns = [f"{name} {i}" for i in range(inputs.shape[1])]
-        self._inputs.show(times, inputs, columns)
+        if session.history:
+            self._text.content = as_html(*self._status())
 
     def _status(self) -> tuple[str, str]:
         """Return where the object is, and how fast the session plays."""
@@ -459,44 +419,3 @@ class Page(WebPage):
                 client.send_file_download("play.mp4", done.result())
 
         film.add_done_callback(send)
-
-    def _save_trace(self, client: Any) -> None:
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "play.trace.npz"
-            write_trace(path, self.session)
-            client.send_file_download(path.name, path.read_bytes())
-
-
-class _Curves:
-    """One plot of the folder "curves". It is made again where its curves change."""
-
-    def __init__(
-        self, gui: Any, folder: Any, title: str, order: int, *, legend: bool = True
-    ) -> None:
-        self._gui = gui
-        self._folder = folder
-        self._options = {
-            "title": title,
-            "order": order,
-            "height": 180,
-            "legend": {"show": legend, "live": False},
-        }
-        self._names: tuple[str, ...] = ()
-        self._plot: Any = None
-
-    def show(self, times: np.ndarray, values: np.ndarray, names: Sequence[str]) -> None:
-        """Show values [T, K] of K names over times [T]."""
-        data = (times, *np.ascontiguousarray(values.T, dtype=float))
-        if tuple(names) == self._names:
-            self._plot.data = data
-            return
-        self._names = tuple(names)
-        if self._plot is not None:
-            self._plot.remove()
-        series: list[dict[str, Any]] = [{"label": "time"}]
-        for i, name in enumerate(names):
-            series.append({"label": name, "stroke": COLORS[i % len(COLORS)], "width": 1.5})
-        with self._folder:
-            self._plot = self._gui.add_uplot(
-                data, tuple(series), scales={"x": {"time": False}}, **self._options
-            )

@@ -1,7 +1,7 @@
 """A live episode: one robot, one object and one goal that a user moves while the policy acts.
 
 The policy is its deployed graph, as on a robot, and the world is one of an engine in numpy: torch is not needed.
-Shape letters: J joints, E fingertips, D numbers that the policy observes.
+Shape letters: J joints, E fingertips.
 """
 
 from __future__ import annotations
@@ -24,7 +24,6 @@ from xreset.geometry.dynamics import drive_values
 from xreset.geometry.kinematics import on_host
 from xreset.geometry.shapes import turn_of
 from xreset.geometry.urdf import joint_limits
-from xreset.live.deploy import training_of
 from xreset.objects.catalogue import ALIASES, canonical_name, object_names
 from xreset.objects.rest import rest_height
 from xreset.objects.sampling import center, surface_points
@@ -38,7 +37,7 @@ from xreset.task.terminations import out_of_bounds
 RESTS = "zero"
 """Name of the policy of a robot that no policy was trained for: the robot rests."""
 KEPT_SECONDS = 60.0
-"""How much of the past a session keeps, for curves, films and traces [s]."""
+"""How much of the past a session keeps, for films [s]."""
 STARTS = 8
 """Synthetic demonstrations that starts and goals are drawn from."""
 LEAST_FRICTION = 0.05
@@ -79,8 +78,6 @@ class Moment:
     goal_quat: np.ndarray
     tip_force: np.ndarray
     """[E, 3] force of each fingertip on the object [N]."""
-    inputs: np.ndarray
-    """[D] what the policy observed before it acted, without the object's points: see :attr:`Session.inputs`."""
     distance: float
     """From the object's origin in the policy's task to its goal [m]."""
     angle: float
@@ -115,8 +112,8 @@ class Session:
         time: seconds since the session's begin.
         history: the last :data:`KEPT_SECONDS` of this object and robot, oldest first.
         away: whether the object is taken away.
-        inputs: name of each part of what the policy observes, and its place in :attr:`Moment.inputs`.
         objects: names of the objects to choose from.
+        points: [P, 3] points of the object's surface that the policy observes, in its mesh frame [m].
         bank: starts and goals.
         random: source of starts and goals.
     """
@@ -224,8 +221,7 @@ class Session:
         self._stiffness = drive_values(policy.robot, "kp")
         shapes = {} if controller is None else controller.shapes
         points = shapes.get("object_points", (64, 3))[0]
-        self._points = surface_points(scene.objects[0], points)
-        self.inputs = {} if controller is None else _observation_names(controller)
+        self.points = surface_points(scene.objects[0], points)
         self.history: deque[Moment] = deque(maxlen=round(KEPT_SECONDS / self.control_dt))
         self._clear()
 
@@ -277,7 +273,7 @@ class Session:
         self._center = center(self.scene.objects[0])
         if self._controller is not None:
             self._controller.begin(
-                self._points,
+                self.points,
                 self.goal_pos,
                 self.goal_quat,
                 self.target,
@@ -291,7 +287,7 @@ class Session:
         Raises:
             XResetError: the engine's numbers are no longer finite; a new episode has begun.
         """
-        inputs = self._act()
+        self._act()
         offset, force, torque = self._pulled()
         self.world.step(self.target + offset, self.scene.substeps, force, torque)
         self.time += self.control_dt
@@ -321,7 +317,6 @@ class Session:
             goal_pos=self.goal_pos,
             goal_quat=self.goal_quat,
             tip_force=self.world.tip_force,
-            inputs=inputs,
             distance=distance,
             angle=angle,
             success=distance <= GOAL_DISTANCE and angle <= GOAL_ANGLE,
@@ -331,11 +326,11 @@ class Session:
             self._touched = self.time
         return moment
 
-    def _act(self) -> np.ndarray:
-        """Let the policy set the targets; return what it observed [D]."""
+    def _act(self) -> None:
+        """Let the policy set the targets."""
         controller = self._controller
         if controller is None:
-            return np.zeros(0)
+            return
         state = self.world.state
         reading = Reading(
             joint_pos=state["joint_pos"],
@@ -348,8 +343,6 @@ class Session:
         )
         controller.set_goal(self.goal_pos, self.goal_quat)
         self.target = controller.step(reading)[0]
-        observed = controller.observations
-        return np.zeros(0) if observed is None or not self.inputs else observed[0]
 
     @property
     def dropped(self) -> bool:
@@ -363,11 +356,6 @@ class Session:
     def lost(self) -> bool:
         """Whether the object has left the table."""
         return bool(out_of_bounds(self.world.state["object_pos"], self.scene.table))
-
-    def cloud(self) -> np.ndarray:
-        """[P, 3] the points of the object's surface that the policy observes, world frame [m]."""
-        state = self.world.state
-        return turn_of(state["object_quat"]).apply(self._points) + state["object_pos"]
 
     # The user's hand --------------------------------------------------------------------------------------------------
 
@@ -471,18 +459,6 @@ class Session:
     def close(self) -> None:
         """Close the engine."""
         self.world.close()
-
-
-def _observation_names(controller: Controller) -> dict[str, slice]:
-    """Return the name of each part of :attr:`Controller.observations`, and its place; none if nobody states them."""
-    layout = training_of(controller, "The policy").observation_layout
-    places = {}
-    begin = 0
-    for group in ("policy", "proprio"):
-        for name, width in layout.get(group, {}).items():
-            places[name] = slice(begin, begin + width)
-            begin += width
-    return places
 
 
 def scene_of(robot: RobotSpec, obj: ObjectSpec, task: TaskConfig) -> SceneSpec:

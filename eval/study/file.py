@@ -159,7 +159,7 @@ class Runs(Checked):
 
 @frozen
 class TableSpec:
-    """A table of the study's page: one for each engine, and a picture."""
+    """A table of the study's page, one for each engine. Without ``paper``, rows are objects and columns runs."""
 
     runs: dict[str, str]
     """Run -> its name in the paper's table, or without ``paper`` its name in this table."""
@@ -167,11 +167,6 @@ class TableSpec:
     """Table of the paper: its figures are shown next to ours, and its rows and columns are used."""
     title: str | None = None
     evaluation: str = "eval"
-    rows: Literal["run", "object", "metric"] = "object"
-    """Rows of a table without ``paper``. The columns are runs, or objects if the rows are runs. ``metric``: the metrics
-    of both versions of the paper, over all objects or ``object``."""
-    object: str | None = None
-    """Only this object; None: all."""
     metric: str = "task_progress"
 
 

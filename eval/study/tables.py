@@ -22,7 +22,6 @@ from xreset.eval.study.plan import Plan
 from xreset.eval.table import Rows, estimate_text
 from xreset.files.checks import frozen
 from xreset.files.text import short_name
-from xreset.objects.catalogue import canonical_name
 
 
 @frozen
@@ -31,7 +30,7 @@ class FilledTable:
 
     title: str
     unit: Literal["%", "cm", "episodes"]
-    """Unit of the figures whose row or column states no other."""
+    """Unit of the figures."""
     engines: dict[str, Rows]
     """Engine -> rows of text; ``-`` where a run was not evaluated."""
     trainings: dict[str, list[Training]]
@@ -79,8 +78,7 @@ def fill(plan: Plan, table: TableSpec) -> FilledTable:
         return estimate_text(key["metric"], *values) + stated.get(theirs, "")
 
     engines = {}
-    has_metrics = "metric" in (layout.rows, layout.columns)
-    unit = "%" if has_metrics else METRICS[layout.metric].unit
+    unit = METRICS[layout.metric].unit
     for engine in sorted(set().union(*(t.results for t in chain(*trainings.values())))):
         lines = [(unit, *(_shown(layout.columns, column) for column in columns))]
         for row in rows:
@@ -105,22 +103,17 @@ def _layout(table: TableSpec, known: list[str]) -> tuple[PaperTable, dict[str, l
     """
     names = {
         "method": list(table.runs.values()),
-        "metric": [name for name, metric in METRICS.items() if metric.unit != "episodes"],
+        "metric": list(METRICS),
         "object": [*known, ALL] if table.paper or len(known) > 1 else known,
     }
     if table.paper:
         return paper_tables()[table.paper], names
-    one = canonical_name(table.object, known) if table.object else None
-    names["object"] = [one] if one else names["object"]
-    rows = "method" if table.rows == "run" else table.rows
-    columns = "object" if table.rows == "run" else "method"
     layout = PaperTable(
         title=METRICS[table.metric].title,
-        rows=rows,
-        columns=columns,
-        names=tuple(names[columns]),
-        values=dict.fromkeys(names[rows], ()),
-        object=one or ALL,
+        rows="object",
+        columns="method",
+        names=tuple(names["method"]),
+        values=dict.fromkeys(names["object"], ()),
         metric=table.metric,
     )
     return layout, names
@@ -175,6 +168,5 @@ def _shown(axis: str, name: str) -> str:
     if axis == "object":
         return "all of them" if name == ALL else short_name(name)
     if axis == "metric":
-        metric = METRICS[name]
-        return metric.title if metric.unit == "%" else f"{metric.title} [{metric.unit}]"
+        return METRICS[name].title
     return name

@@ -45,5 +45,6 @@ REMOVED: dict[str, dict[str, Any]] = {
     "Evaluation": {"unseen": False},
     "EvalResult": {"measured": {}},
     "Runs": {"evaluations": [], "gpus": 1},
+    "TableSpec": {"rows": "object", "object": None},
 }
 """Data class -> option -> the value that means what is done now. Files with another value are refused."""

@@ -26,7 +26,6 @@ from xreset.eval.report.curves import amounts, draw_lines, line, usual_axis
 from xreset.eval.report.groups import grouped, scores
 from xreset.eval.report.make import collect, page
 from xreset.eval.report.read import read_curves, read_training, read_trainings
-from xreset.eval.report.tables import lifted
 from xreset.eval.results import read_evaluation
 from xreset.eval.stats import (
     bootstrap_ci95,
@@ -35,7 +34,7 @@ from xreset.eval.stats import (
     difference_p,
     holm,
 )
-from xreset.learning.clock import Lift, Passing, write_lift
+from xreset.learning.clock import Lift, write_lift
 from xreset.learning.run import TEACHER, RobotData
 from xreset.task.config import ResetConfig, TaskConfig, TerminationConfig
 
@@ -232,36 +231,6 @@ class ProgressTest(Compared):
         for members in ([b], [b, broken]):
             found = line(members, "task/success", "minutes")
             assert_allclose(found.T, [[0.2, 0.6, 0.8]] * 3)
-
-
-class LiftTest(Compared):
-    def lifted(self, name, end, *passed, **changes):
-        """A run with a lift clock: minutes until its end and until each share that it passed."""
-
-        def at(minutes):
-            iteration = round(10 * minutes)
-            return {"iteration": iteration, "env_steps": 100000 * iteration, "minutes": minutes}
-
-        passings = tuple(Passing(share=s, **at(t)) for s, t in passed)
-        write_lift(self.write_run(name, **changes), Lift(passed=passings, **at(end)))
-        return name
-
-    def test_seeds_are_one_row(self):
-        self.lifted("x-s0", 12.0, (0.01, 6.0), (0.1, 8.5))
-        self.lifted("x-s1", 10.0, (0.01, 7.0), seed=1)
-        self.lifted("other", 8.0, num_envs=128)
-        self.write_curves("old", curves_of((60.0, 60.0), (0.0, 0.04)))
-        text = self.compare("x-s0", "x-s1", "other", "old")
-        row = (
-            " x | 2 | 100% (34-100); 6.0, 7.0 | 50% (9-91); 8.5, >10.0 | 0% (0-66); >12.0, >10.0 |"
-        )
-        self.assertIn(row, text)
-        clocks = {"x": [run.lift for run in self.report.trainings[:2]]}
-        cells = lifted(clocks, "iterations")[1]
-        self.assertEqual(
-            [cell.partition("; ")[2] for cell in cells[2:]], ["60, 70", "85, >100", ">120, >100"]
-        )
-        self.assertIn(" other | 1 |" + " 0% (0-79); >8.0 |" * 3, text)
 
 
 class GroupTest(Compared):
@@ -640,7 +609,6 @@ class WrittenTest(Compared):
         runs = read_trainings([self.folder / name for name in names])
         self.assertEqual(collect(runs[3:]).curves, "")
         default = collect(runs)
-        self.assertEqual(default.x, "minutes")
         self.assertIn("at the goal, from home", default.curves)
         self.assertIn("minutes of training", default.curves)
         self.assertNotIn("speed/learn_seconds", default.curves)

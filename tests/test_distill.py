@@ -6,7 +6,6 @@ from dataclasses import replace
 from unittest.mock import patch
 
 import numpy as np
-import pandas as pd
 import torch
 
 from tests.data import refuses
@@ -15,7 +14,6 @@ from tests.toy_training import CONFIG, OPTIONS, WithBank, quickly
 from xreset import make_env, train
 from xreset.cameras.config import FRONT, WRIST, VisionConfig
 from xreset.errors import PolicyError, XResetError
-from xreset.eval.report.fairness import missed_by_student
 from xreset.learning.checkpoint import read_checkpoint
 from xreset.learning.config import PpoConfig, TrainConfig
 from xreset.learning.from_onnx import network_of
@@ -183,30 +181,3 @@ class DistillTest(WithBank):
         ):
             with self.subTest(options):
                 self.assert_resumed(f"train --out {self.run_folder} {options}", problem)
-
-    def test_what_the_teacher_does_better(self):
-        common = {
-            "engine": "mujoco",
-            "seed": 0,
-            "sequence_name": list("abcd"),
-            "repetition": 0,
-            "object": ["can", "can", "box", "box"],
-        }
-        teacher = pd.DataFrame(common | {"reorient": [True, True, True, False]})
-        student = pd.DataFrame(
-            common
-            | {
-                "reorient": [True, False, False, False],
-                "final_position_error": [0.01, 0.019, 0.3, 0.01],
-            }
-        )
-        self.assertEqual(
-            missed_by_student(student, teacher),
-            "Of 3 episodes that the teacher ends at the goal, the student misses 2: can 1 of 2, box 1 of 1. "
-            "In 1 of these the object ends within 2 cm of its place, but is turned wrongly.",
-        )
-        unsolved = teacher.assign(reorient=False)
-        words = "The teacher ends none of 4 episodes at the goal."
-        self.assertEqual(missed_by_student(student, unsolved), words)
-        for other in ({"engine": "sapien"}, {"seed": 1}):
-            self.assertEqual(missed_by_student(student.assign(**other), teacher), "", other)

@@ -192,29 +192,8 @@ class CollectTest(Reported):
         self.write(vision=SEEING)
         self.assertEqual(self.read()[0].vision, SEEING)
         self.assertEqual(self.collect().notes, ())
-        self.write_teacher()
-        [note] = self.collect().notes
-        words = "Of 1 episode that the teacher ends at the goal, the student misses 0."
-        self.assertEqual(note, words)
         self.write_soup()
         self.assertIsNone(self.read()[0].vision, "the run's configuration has no camera")
-
-    def write_teacher(self, engine="mujoco", **changes):
-        result = toy_result(engine, **changes)
-        write_result(self.folder / "teacher", result, toy_rollouts().traces, ("a", "b", "c"))
-
-    def test_a_teacher_that_played_other_episodes_is_not_compared(self):
-        self.write(("mujoco",))
-        self.write_run("", teacher="many-objects")
-        for engine, demos in ((None, ""), ("sapien", "ab"), ("mujoco", "cd"), ("mujoco", "ab")):
-            if engine is not None:
-                self.write_teacher(engine, inputs={"demos": demos})
-            [note] = self.collect().notes
-            with self.subTest(engine=engine, demos=demos):
-                self.assertEqual(
-                    note.startswith("The teacher was not evaluated from the same starts. Make"),
-                    (engine, demos) != ("mujoco", "ab"),
-                )
 
     def test_nothing_to_report(self):
         self.folder.mkdir()

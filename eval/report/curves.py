@@ -26,12 +26,12 @@ if TYPE_CHECKING:
 
 X = Literal["minutes", "steps", "iterations"]
 """Measure of the length of a training."""
-AXES: dict[X, tuple[str, int, str, float]] = {
-    "minutes": ("minutes of training", 1, "minutes", 1.0),
-    "steps": ("million environment steps", 1, "env_steps", 1e-6),
-    "iterations": ("iterations of training", 0, "iteration", 1.0),
+AXES: dict[X, tuple[str, int]] = {
+    "minutes": ("minutes of training", 1),
+    "steps": ("million environment steps", 1),
+    "iterations": ("iterations of training", 0),
 }
-"""Label of a measure, digits in tables, field of :class:`~xreset.learning.clock.Lift`, and factor to its unit."""
+"""Label of a measure, and digits in tables."""
 _SPEED = ["speed/collect_seconds", "speed/learn_seconds", "speed/env_steps_per_second"]
 CURVES = {
     "task/success": "at the goal",

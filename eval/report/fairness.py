@@ -8,13 +8,11 @@ from typing import Any
 
 import pandas as pd
 
-from xreset.eval.metrics import GOAL_DISTANCE
 from xreset.eval.report.read import Training, by_engine, how_to_evaluate
-from xreset.eval.results import Evaluation, read_evaluation
 from xreset.eval.stats import Table
 from xreset.files.storage import file_hash
 from xreset.files.text import quantity, short_name
-from xreset.learning.run import CHOICE, TEACHER
+from xreset.learning.run import CHOICE
 from xreset.task.config import evaluation_task
 
 _CONDITIONS = ("objects", "object meshes", "number of episodes", "seed of the evaluation")
@@ -53,7 +51,6 @@ def remarks(trainings: Sequence[Training]) -> list[str]:
             found.append(f"{training.label} has no results. {how_to_evaluate(training.folder)}")
             continue
         found += _outdated(training)
-        found += _about_teacher(training)
         if len(trainings) == 1:
             found += expected(training)
     return found
@@ -75,24 +72,6 @@ def _outdated(training: Training) -> list[str]:
     return [
         f"The results of {training.label} in {', '.join(engines)} are of another policy than its policy.onnx. If the "
         f"training went on since, evaluate again: xreset eval {folder} --demos DEMOS"
-    ]
-
-
-def _about_teacher(training: Training) -> list[str]:
-    """Return what a student misses of its teacher's episodes, or how to make the teacher's results."""
-    folder = training.folder
-    taught = Evaluation()
-    for result in read_evaluation(folder / "teacher"):
-        own = training.results.get(result.engine)
-        if own is not None and own.inputs.get("demos") == result.inputs.get("demos"):
-            taught.append(result)
-    if taught and (missed := missed_by_student(training.episodes, taught.to_frame())):
-        return [missed]
-    if training.run is None or training.run.teacher is None:
-        return []
-    return [
-        "The teacher was not evaluated from the same starts. Make its results first: "
-        f"xreset eval {folder / TEACHER} --out {folder / 'teacher'} --demos DEMOS"
     ]
 
 
@@ -197,33 +176,6 @@ def begun(trainings: Sequence[Training]) -> list[str]:
                 "its minutes and steps are not all that its policy took."
             )
     return found
-
-
-def missed_by_student(student: Table, teacher: Table) -> str:
-    """Return a text about the episodes that the teacher ends at the goal and the student does not: their objects, and
-    how often only the rotation is wrong. It is empty if no episode is of both.
-
-    Args:
-        student: episodes of the policy.
-        teacher: episodes of its teacher; those from the same starts, in the same engines, are compared.
-    """
-    same = ["engine", "seed", "sequence_name", "repetition", "object"]
-    both = student.merge(teacher, on=same, suffixes=("", "_teacher"))
-    solved = both[both["reorient_teacher"]]
-    if not len(solved):
-        return f"The teacher ends none of {len(both)} episodes at the goal." if len(both) else ""
-    missed = solved[~solved["reorient"]]
-    text = f"Of {quantity(len(solved), 'episode')} that the teacher ends at the goal, the student misses {len(missed)}"
-    if not len(missed):
-        return f"{text}."
-    parts = []
-    for name, count in missed["object"].value_counts().items():
-        parts.append(f"{name} {count} of {int((solved['object'] == name).sum())}")
-    turned = int((missed["final_position_error"] <= GOAL_DISTANCE).sum())
-    return (
-        f"{text}: {', '.join(parts)}. "
-        f"In {turned} of these the object ends within {100 * GOAL_DISTANCE:.0f} cm of its place, but is turned wrongly."
-    )
 
 
 def health(label: str, episodes: Iterable[tuple[Any, Table]]) -> list[str]:

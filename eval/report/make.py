@@ -20,7 +20,7 @@ from xreset.eval.pages import percent, render
 from xreset.eval.plots import COLORS
 from xreset.eval.report import fairness, tables
 from xreset.eval.report.clips import Clip, draw_report
-from xreset.eval.report.curves import AXES, X, draw_training, usual_axis
+from xreset.eval.report.curves import draw_training, usual_axis
 from xreset.eval.report.goals import goal_distances
 from xreset.eval.report.groups import (
     COUNTED,
@@ -61,7 +61,6 @@ class Report(Brief):
     """:func:`xreset.eval.report.groups.scores`, and the differences to the first group."""
     curves: str
     """Drawing of the learning curves; empty if there are none."""
-    x: X
     clips: Sequence[Clip] = ()
     strips: Sequence[Clip] = ()
     """Failures."""
@@ -100,15 +99,13 @@ def collect(
     if not title and len(trainings) == 1 and trainings[0].results:
         first = trainings[0].first
         title = f"{first.policy} on {first.robot}"
-    x = usual_axis(trainings)
     return Report(
         title=title or ", ".join(groups),
         trainings=tuple(trainings),
         groups=groups,
         notes=tuple(dict.fromkeys(notes)),  # each sentence once
         scores=pd.concat([found, differences(groups)], ignore_index=True),
-        curves=draw_training(groups, x),
-        x=x,
+        curves=draw_training(groups, usual_axis(trainings)),
         tables=page_tables,
     )
 
@@ -153,9 +150,6 @@ def page(report: Report) -> str:
         counts = {what: count for what, count in count_failures(own).items() if count}
         if counts:
             failures.append((training, len(own), counts))
-    clocks = {}
-    for label, members in groups.items():
-        clocks[label] = [member.lift for member in members]
     return render(
         "report.html.j2",
         report=report,
@@ -182,8 +176,6 @@ def page(report: Report) -> str:
         turns=_by_class(places, "turn", TURNS),
         goals=_by_class(places, "goal_distance", GOALS),
         demonstrations=_by(places, ["sequence_name", "object"]),
-        lifted=tables.lifted(clocks, report.x),
-        x=AXES[report.x][0],
         different=tables.different(groups) if len(report.trainings) > 1 else (),
     )
 

@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from math import isnan
 
-from scipy.stats import binomtest
-
 from xreset.eval.metrics import METRICS
-from xreset.eval.report.curves import AXES, X, amounts
+from xreset.eval.report.curves import AXES, amounts
 from xreset.eval.report.groups import EVERY, Groups, by_engine, certain_differences, counted
 from xreset.eval.report.read import Training, versions
 from xreset.eval.stats import Table
 from xreset.eval.table import Rows, points_text
 from xreset.files.checks import frozen
-from xreset.learning.clock import SHARES, Lift
 
 
 @frozen
@@ -92,37 +88,6 @@ def results(groups: Groups, scores: Table) -> list[Row]:
     return rows
 
 
-def lifted(clocks: Mapping[str, Sequence[Lift]], x: X) -> Rows:
-    """Return a table of first success: a row for each group of trainings, a column for each share of success.
-
-    Args:
-        clocks: label -> the lift clock of each training. Trainings without iterations are left out.
-        x: unit of the times.
-    """
-    rows = [["", "runs", *(f"{100 * share:g} %" for share in SHARES)]]
-    for label, every in clocks.items():
-        begun = [clock for clock in every if clock.iteration]
-        if begun:
-            cells = [_lifted(begun, share, x) for share in SHARES]
-            rows.append([label, str(len(every)), *cells])
-    return rows
-
-
-def _lifted(clocks: Sequence[Lift], share: float, x: X) -> str:
-    """Return as text how many trainings passed a share of success, with the 95 % Wilson interval, and when each did;
-    ``>``: not until then."""
-    _, digits, field, scale = AXES[x]
-    times = []
-    hits = 0
-    for clock in clocks:
-        passed = [passing for passing in clock.passed if passing.share == share]
-        hits += len(passed)
-        amount = getattr(passed[0] if passed else clock, field) * scale
-        times.append(f"{'' if passed else '>'}{amount:.{digits}f}")
-    low, high = binomtest(hits, len(clocks)).proportion_ci(method="wilson")
-    return f"{hits / len(clocks):.0%} ({100 * low:.0f}-{100 * high:.0f}); {', '.join(times)}"
-
-
 def different(groups: Groups) -> Rows:
     """Return a table of the fields in which trainings differ, with a column for each group, and their lengths.
 
@@ -135,7 +100,7 @@ def different(groups: Groups) -> Rows:
             facts[label] = [member.facts | _lengths(member) for member in members]
             for known in facts[label]:
                 names |= dict.fromkeys(known)
-    lengths = [label for label, *_ in AXES.values()]
+    lengths = [label for label, _ in AXES.values()]
     rows = [["", *facts]]
     for name in names:
         cells = []
@@ -155,7 +120,7 @@ def _lengths(member: Training) -> dict[str, str]:
     lengths = {}
     if not len(member.curves):
         return lengths
-    for x, (label, digits, *_) in AXES.items():
+    for x, (label, digits) in AXES.items():
         done = amounts(member, x)
         if done is not None:
             lengths[label] = f"{done.iloc[-1]:,.{digits}f}"

@@ -10,7 +10,7 @@ from tests.command import succeeds
 from tests.data import InFolder, InOneFolder, refuses
 from tests.toy_bank import SOUP, in_this_process
 from tests.toy_goals import toy_goals
-from xreset import GoalConfig, load_object, load_policy, load_robot
+from xreset import load_object, load_policy, load_robot
 from xreset.errors import DemoError, FileFormatError, GoalError, ObjectError
 from xreset.eval.rollout import engine, load_trial, roll_out
 from xreset.files.records import npz_schema
@@ -32,7 +32,7 @@ class MadeTest(InOneFolder):
         cls.banana = load_object(BANANA)
         zeros = {"START_OFFSET": np.zeros(3), "GOAL_OFFSET": np.zeros(4)}
         with patch.multiple("xreset.resets.goals", **zeros):
-            cls.exact = make_goals(["banana"], robot=cls.robot, config=GoalConfig(per_family=1))
+            cls.exact = make_goals(["banana"], robot=cls.robot, per_family=1)
 
     def centers(self, goals, which):
         """[S, 3] centres of mass."""
@@ -60,9 +60,7 @@ class MadeTest(InOneFolder):
         assert_allclose(np.abs(turn.as_rotvec()[:4]), expected, atol=1e-5)
 
     def test_offsets_are_those_of_the_published_paper(self):
-        goals = make_goals(
-            ["banana"], robot=self.robot, families=["lift"], config=GoalConfig(per_family=8)
-        )
+        goals = make_goals(["banana"], robot=self.robot, families=["lift"], per_family=8)
         shift = self.centers(goals, "goal") - self.centers(goals, "start") - [0.0, 0.0, 0.2]
         self.assertTrue((np.abs(shift) <= [0.05, 0.05, 0.05]).all(), shift)
         self.assertTrue((np.ptp(shift, axis=0) > 0.01).all(), shift)
@@ -100,9 +98,8 @@ class MadeTest(InOneFolder):
         options = ("--family yaw --family yaw --per-family 2 --seed 3 --pose", *pose)
         said = succeeds("goals banana --robot ur7e-sharpa --out", file, *options)
         self.assertIn("3 goals of 1 object (2 yaw, 1 own)", said)
-        config = GoalConfig(per_family=2, seed=3)
         expected = make_goals(
-            ["banana"], robot=self.robot, families=["yaw"], poses=[pose], config=config
+            ["banana"], robot=self.robot, families=["yaw"], poses=[pose], per_family=2, seed=3
         )
         assert_allclose(read_goals(file).goal_pos, expected.goal_pos)
         own = np.concatenate((expected.goal_pos[2], expected.goal_quat_wxyz[2]))

@@ -33,7 +33,6 @@ from xreset.eval.rollout import load_trial
 from xreset.files.storage import file_hash
 from xreset.objects.catalogue import object_source
 from xreset.resets.bank import check_objects, starts_and_goals
-from xreset.resets.config import GoalConfig
 from xreset.resets.inputs import load_inputs
 from xreset.retarget.file import object_sources
 
@@ -124,7 +123,7 @@ class InputsTest(InOneFolder):
         bank = folder / "runs" / "resets.npz"
         make_bank(motion, out=bank)
         goals = folder / "runs" / "goals.npz"
-        make_goals([SOUP], robot=mine, families="lift", config=GoalConfig(per_family=1), out=goals)
+        make_goals([SOUP], robot=mine, families="lift", per_family=1, out=goals)
         for file in (motion, bank, goals):
             self.assertEqual(load_inputs(file).robot.urdf, robot.urdf, file.name)
         write_bank(bank, toy_bank(robot))

@@ -41,7 +41,6 @@ from xreset.resets.bank import read_bank as read_bank
 from xreset.resets.bank import write_bank as write_bank
 from xreset.resets.config import ClosingConfig as ClosingConfig
 from xreset.resets.config import FilterConfig as FilterConfig
-from xreset.resets.config import GoalConfig as GoalConfig
 from xreset.resets.config import SqueezeConfig as SqueezeConfig
 from xreset.resets.config import TransferConfig as TransferConfig
 from xreset.resets.goals import GoalSet as GoalSet

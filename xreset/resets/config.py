@@ -9,7 +9,6 @@ from xreset.files.checks import (
     Length,
     NonNegativeFloat,
     NonNegativeInt,
-    Options,
     PositiveFloat,
     PositiveInt,
     frozen,
@@ -61,16 +60,3 @@ class TransferConfig(Checked):
 
     per_pose: NonNegativeInt = 8
     """Most states at each pose. 0: no states are added."""
-
-
-@frozen
-class GoalConfig(Checked, Options):
-    """How a goal set is drawn (:mod:`xreset.resets.goals`)."""
-
-    per_family: PositiveInt = 20
-    """Goals of each object and family."""
-    upright: bool = False
-    """Whether objects start in the resting pose in which their mesh's z axis points up. Otherwise they start in any of
-    their resting poses, on a broad face more often than on a narrow one."""
-    seed: NonNegativeInt = 0
-    """The same seed gives the same goals."""

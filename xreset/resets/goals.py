@@ -13,8 +13,8 @@ those of the published paper, and goals drawn at random:
 from __future__ import annotations
 
 import zlib
-from collections.abc import Sequence
-from dataclasses import asdict, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -38,7 +38,6 @@ from xreset.resets.bank import (
     same_source,
     stated_sources,
 )
-from xreset.resets.config import GoalConfig
 from xreset.spec import ObjectSpec, RobotSpec
 
 if TYPE_CHECKING:
@@ -103,7 +102,10 @@ def drawn_goals(
     robot: RobotSpec,
     families: str | Sequence[str] | None,
     poses: Sequence[Sequence[float]],
-    config: GoalConfig,
+    *,
+    per_family: int,
+    upright: bool,
+    seed: int,
     progress: Progress,
 ) -> GoalSet:
     """Return starts and goals of objects; see :func:`xreset.resets.verbs.make_goals`."""
@@ -118,11 +120,11 @@ def drawn_goals(
     for obj in objects:
         for pos, quat in own:
             _check_above_table(obj.name, rest_height(obj, quat) - pos[2])
-    rests = _resting_poses(objects, robot, upright=config.upright)
+    rests = _resting_poses(objects, robot, upright=upright)
     from xreset.resets.reach import Reach  # torch, which a player of goals does not need
 
     reach = Reach(robot)
-    wanted = [*product(families, range(config.per_family)), *product([OWN], range(len(own)))]
+    wanted = [*product(families, range(per_family)), *product([OWN], range(len(own)))]
     episodes = []
     for obj in objects:
         done = len(episodes)
@@ -131,7 +133,7 @@ def drawn_goals(
             drawn = []
             for family, number in wanted:
                 if (family, number) not in found:
-                    drawn.append(_draw(obj, rests[obj.name], own, config, family, number, attempt))
+                    drawn.append(_draw(obj, rests[obj.name], own, seed, family, number, attempt))
             found |= {(e.family, e.number): e for e in _reached(reach, drawn)}
             progress(done + len(found), len(wanted) * len(objects))
         if missing := [
@@ -149,16 +151,15 @@ def drawn_goals(
 def write_goals(
     path: str | Path,
     goals: GoalSet,
-    config: GoalConfig | None = None,
     *,
+    config: Mapping[str, Any] | None = None,
     robot: str | Path | None = None,
     meshes: str | Path | None = None,
 ) -> None:
     """Write a goal set, how it was drawn, the name or folder of the robot, and the folder of the objects' meshes; see
     :func:`xreset.files.records.write_record`."""
-    made_with = asdict(config) if config else {}
-    made_with["robot"] = str(robot or goals.robot)
-    made_with["meshes"] = str(meshes) if meshes else None
+    stated = {"robot": str(robot or goals.robot), "meshes": str(meshes) if meshes else None}
+    made_with = {**(config or {}), **stated}
     write_record(GoalSet, path, SCHEMA, goals, check=bank_problem, config=made_with)
 
 
@@ -334,13 +335,13 @@ def _draw(
     obj: ObjectSpec,
     rests: Sequence[tuple[float, Rotation]],
     own: Sequence[tuple[np.ndarray, np.ndarray]],
-    config: GoalConfig,
+    seed: int,
     family: str,
     number: int,
     attempt: int,
 ) -> _Episode:
     """Draw a start and a goal. The arguments alone decide what is drawn."""
-    key = [config.seed, zlib.crc32(f"{obj.name} {family}".encode()), number, attempt]
+    key = [seed, zlib.crc32(f"{obj.name} {family}".encode()), number, attempt]
     random = np.random.default_rng(key)
     height, resting = rests[int(random.integers(len(rests)))]
     (x, y), (goal_x, goal_y) = random.uniform(*np.transpose(WORKSPACE), size=(2, 2))

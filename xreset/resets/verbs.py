@@ -12,17 +12,11 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from xreset.files.checks import Option, OutputFile, PositiveInt, obeys_rules
+from xreset.files.checks import Option, OutputFile, PositiveInt, Seed, obeys_rules
 from xreset.files.progress import NamedProgress, Progress, unseen
 from xreset.files.records import replaces
 from xreset.physics.plugins import Device
-from xreset.resets.config import (
-    ClosingConfig,
-    FilterConfig,
-    GoalConfig,
-    SqueezeConfig,
-    TransferConfig,
-)
+from xreset.resets.config import ClosingConfig, FilterConfig, SqueezeConfig, TransferConfig
 
 if TYPE_CHECKING:
     from xreset.resets.bank import ResetBank
@@ -150,7 +144,9 @@ def make_goals(
     meshes: str | Path | None = None,
     families: Annotated[str | Sequence[str] | None, Option("family")] = None,
     poses: Annotated[Sequence[Pose], Option("pose")] = (),
-    config: GoalConfig | None = GoalConfig(),
+    per_family: PositiveInt = 20,
+    upright: bool = False,
+    seed: Seed = 0,
     progress: Progress = unseen,
 ) -> GoalSet:
     """Give objects starts and goals without demonstrations, for xreset eval --demos and xreset train --goals.
@@ -167,7 +163,10 @@ def make_goals(
             the world) or random; default: all of them, or none if there are poses.
         poses: goal of your own for every object, a pose of the mesh frame: x y z [m] and quaternion w x y z; or
             several.
-        config: number, sizes, offsets and seed.
+        per_family: goals of each object and family.
+        upright: whether objects start in the resting pose in which their mesh's z axis points up. Otherwise they start
+            in any of their resting poses, on a broad face more often than on a narrow one.
+        seed: the same seed gives the same goals.
         progress: called with (goals found, goals in all).
 
     Raises:
@@ -178,11 +177,16 @@ def make_goals(
     from xreset.objects.catalogue import load_objects
     from xreset.resets.goals import drawn_goals, write_goals
 
-    config = config or GoalConfig()
+    config = {"per_family": per_family, "upright": upright, "seed": seed}
     found = drawn_goals(
-        load_objects(names, meshes), load_robot(robot), families, poses, config, progress
+        load_objects(names, meshes),
+        load_robot(robot),
+        families,
+        poses,
+        **config,
+        progress=progress,
     )
     if out is not None:
         stated = robot if isinstance(robot, str | Path) else None
-        write_goals(out, found, config, robot=stated, meshes=meshes)
+        write_goals(out, found, config=config, robot=stated, meshes=meshes)
     return found

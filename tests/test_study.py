@@ -197,7 +197,7 @@ class PlanTest(Studied):
         return calls[0]
 
     def test_changes_of_the_recipe_are_flags(self):
-        changes = "task.reset = { random_gravity = false, demo_probability = 0.25, object_share = { 010_potted_meat_can = 3.0 } }\nmodel.pointnet = [8, 6]\ntask.action.hand_zero = 'middle'\n"
+        changes = "task.reset = { random_gravity = false, demo_probability = 0.25, object_share = { 010_potted_meat_can = 3.0 } }\nmodel.pointnet = [8, 6]\ntask.action.hand = 'relative'\n"
         plan = self.plan(f"{BASE}[runs.a]\nsteps = 1e6\nnum_envs = 64\n[runs.a.config]\n{changes}")
         (planned,) = plan.runs
         reset = TrainConfig().task.reset

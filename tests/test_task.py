@@ -519,15 +519,6 @@ class ActionTest(TestCase):
         moved = space.targets(tensor([[1.0, 1, -1, 0, 0, 0, 0]]), near, near)
         assert_close(moved[:, :3], tensor([[0.3, 3.0, -2.0]]))
 
-    def test_action_zero_may_be_home(self):
-        space = self.space(hand_zero="home")
-        home = torch.as_tensor(self.robot.home, dtype=torch.float32)
-        actions = tensor([[0.0], [1.0], [-1.0], [0.5]]).expand(4, 7)
-        target = torch.zeros(4, 7)
-        found = space.targets(actions, target, target)
-        expected = torch.stack((home, space.upper, space.lower, (home + space.upper) / 2))
-        assert_close(found[:, 3:], expected[:, 3:])
-
     def test_a_relative_hand_that_does_nothing_holds_its_targets(self):
         space = self.space(hand="relative", hand_step=0.05, hand_lead=0.4)
         # the last one slides, by 4 cm in all
@@ -545,13 +536,12 @@ class ActionTest(TestCase):
         assert_close(action[:, 3:], torch.full((1, 4), 0.4))
 
     def test_action_for_undoes_targets(self):
-        for options in ({}, {"hand_zero": "home"}):
-            g = generator()
-            space = self.space(**options)
-            target = space.lower + (space.upper - space.lower) * torch.rand(50, 7, generator=g)
-            wanted = space.targets(2 * torch.rand(50, 7, generator=g) - 1, target, target)
-            again = space.targets(space.action_for(wanted, target), target, target)
-            assert_close(again, wanted, atol=1e-5, rtol=0)
+        g = generator()
+        space = self.space()
+        target = space.lower + (space.upper - space.lower) * torch.rand(50, 7, generator=g)
+        wanted = space.targets(2 * torch.rand(50, 7, generator=g) - 1, target, target)
+        again = space.targets(space.action_for(wanted, target), target, target)
+        assert_close(again, wanted, atol=1e-5, rtol=0)
 
 
 class LatencyTest(TestCase):
@@ -1392,10 +1382,10 @@ class PolicyTest(TestCase):
                 {"perception": {"cloud": {"frames": 5, "noise": 0.1, "scale": 5.0}}},
             )
         )
-        home = {"action": ActionConfig(hand_zero="home")}
+        relative = {"action": ActionConfig(hand="relative")}
         for words, changes in (
             ("observation layout .perception.cloud: 960, here 576", fewer),
-            ("another action mapping .hand_zero: 'middle', here 'home'", home),
+            ("another action mapping .hand: 'absolute', here 'relative'", relative),
             (
                 "another scale of observations .perception: .*'scale': 1.0.*, here .*'scale': 5.0",
                 scaled,

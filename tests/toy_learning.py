@@ -36,7 +36,7 @@ CONFIG = TrainConfig(
     task=TaskConfig(
         timestep=1 / 120,
         substeps=2,
-        action=ActionConfig(arm_step=0.01, hand_zero="home"),
+        action=ActionConfig(arm_step=0.01),
         observation=ObservationConfig(
             cloud_points=8, perception={"cloud": {"frames": 1, "noise": 0.002, "scale": 1.0}}
         ),
@@ -58,7 +58,7 @@ RECIPE = replace(
     task=replace(
         TASK,
         randomization=RandomizationConfig(),
-        action=replace(TASK.action, arm_step=0.02, hand_zero="home"),
+        action=replace(TASK.action, arm_step=0.02),
         observation=replace(TASK.observation, cloud_points=8),
         termination=CONFIG.task.termination,
         reset=CONFIG.task.reset,

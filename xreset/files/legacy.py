@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 REMOVED: dict[str, dict[str, Any]] = {
-    "ActionConfig": {"hand_smoothing": 1.0},
+    "ActionConfig": {"hand_smoothing": 1.0, "hand_zero": "middle"},
     "RewardConfig": {
         "tracking": "presence",
         "progress": 8.0,

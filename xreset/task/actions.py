@@ -19,7 +19,7 @@ class ActionSpace:
     """Maps actions [N, J] in [-1, 1] to joint targets [N, J].
 
     Arm joints are relative. Hand joints are absolute within their limits or, if so configured, relative as well. An
-    absolute target is piecewise linear in its action: the lower limit at -1, :attr:`zero` at 0, the upper limit at +1.
+    absolute target is linear in its action: the lower limit at -1, the upper limit at +1.
 
     Attributes:
         lower: [J] joint limits.
@@ -27,9 +27,8 @@ class ActionSpace:
         is_arm: [J] bool
         step: [J] how far a relative target moves under action 1 [rad, m]; 0 for joints with absolute targets.
         lead: [J] farthest that a relative target may be ahead of its joint [rad, m].
-        zero: [J] a hand joint's absolute target under action 0; 0 for arm joints.
-        below: [J] from ``zero`` down to the lower limit, reached at -1; 1 for arm joints.
-        above: [J] from ``zero`` up to the upper limit, reached at +1; 1 for arm joints.
+        middle: [J] of a hand joint's limits, its absolute target under action 0; 0 for arm joints.
+        half: [J] half the range of a hand joint; 1 for arm joints.
     """
 
     def __init__(
@@ -46,23 +45,14 @@ class ActionSpace:
         if config.jaw_step is not None and stiffness is not None:
             (own,) = unit[~is_arm].tolist()
             hand_step = min(hand_step, config.jaw_step / (stiffness * own))
-        zero = (lower + upper) / 2
-        below = (upper - lower) / 2
-        above = below
-        if config.hand_zero == "home":
-            home = torch.as_tensor(robot.home, dtype=torch.float32, device=device)
-            zero = home.clamp(lower, upper)
-            below = zero - lower
-            above = upper - zero
         self.lower = lower
         self.upper = upper
         self.is_arm = is_arm
         self.step = torch.where(is_arm, config.arm_step, unit * hand_step)
         self.lead = torch.where(is_arm, config.arm_lead, unit * config.hand_lead)
         # Continuous arm joints have infinite limits; nothing may multiply their infinity by 0.
-        self.zero = torch.where(is_arm, 0.0, zero)
-        self.below = torch.where(is_arm, 1.0, below)
-        self.above = torch.where(is_arm, 1.0, above)
+        self.middle = torch.where(is_arm, 0.0, (lower + upper) / 2)
+        self.half = torch.where(is_arm, 1.0, (upper - lower) / 2)
 
     def targets(self, action: Tensor, target: Tensor, joint_pos: Tensor) -> Tensor:
         """Return new joint targets [N, J] for actions, old targets and joint positions, each [N, J].
@@ -74,8 +64,7 @@ class ActionSpace:
         new = target + self.step * action
         new = new.clamp(joint_pos - self.lead, joint_pos + self.lead)
         if self.config.hand == "absolute":
-            hand = self.zero + torch.where(action < 0, self.below, self.above) * action
-            new = torch.where(self.is_arm, new, hand)
+            new = torch.where(self.is_arm, new, self.middle + self.half * action)
         return new.clamp(self.lower, self.upper)
 
     def action_for(self, wanted: Tensor, target: Tensor) -> Tensor:
@@ -87,6 +76,4 @@ class ActionSpace:
 
     def absolute_action(self, joint_pos: Tensor) -> Tensor:
         """Return the actions [N, J] whose absolute targets are these positions of the hand's joints."""
-        from_zero = joint_pos - self.zero
-        slope = torch.where(from_zero < 0, self.below, self.above)
-        return from_zero / slope.clamp_min(1e-9)
+        return (joint_pos - self.middle) / self.half.clamp_min(1e-9)

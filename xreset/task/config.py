@@ -67,10 +67,6 @@ class ActionConfig(Checked):
     hand_lead: PositiveFloat = 0.4
     """Largest distance from a hand joint to its target [rad]. It limits how hard the joint presses: drives of the
     Sharpa hand reach their effort limits at 0.3 to 0.7."""
-    hand_zero: Literal["middle", "home"] = "middle"
-    """Target of a hand joint under action 0: the middle of its limits, or the robot's home pose, from which -1 and +1
-    lead to the limits along two slopes. A new policy's mean is 0: with ``middle`` it half closes the hand at once and
-    meets the object with its knuckles. Not in the paper."""
 
 
 def _terms(**terms: dict[str, Any]) -> Any:

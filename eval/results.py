@@ -246,12 +246,10 @@ class Evaluation(list[EvalResult]):
             engine = result.engine
             if engine not in theirs:
                 continue
-            tables = []
+            tables = [theirs[engine].nominal, result.nominal]
             played = []
             for own in (theirs[engine], result):
-                table = own.to_frame()
-                tables.append(table[table["property"] == ""])
-                episodes = tables[-1][starts].to_numpy().tolist()
+                episodes = own.nominal[starts].to_numpy().tolist()
                 played.append((episodes, own.seed, own.meshes, own.episode_seconds))
             if played[0] != played[1] or _turned_otherwise(*tables):
                 raise RunError(

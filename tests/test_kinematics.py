@@ -102,6 +102,17 @@ class UrdfTest(InFolder):
         vertices = np.asarray(load_urdf(path).link("end").collisions[0].geometry.vertices)
         self.assertAlmostEqual(np.ptp(vertices[:, 0]), 0.3)
 
+    def test_collada_states_its_unit(self):
+        mesh = self.folder / "box.dae"
+        trimesh.creation.box((10, 20, 30)).export(mesh)
+        unit = '<unit name="centimeter" meter="0.01"/></asset>'
+        mesh.write_text(mesh.read_text().replace("</asset>", unit))
+        shape = '<collision><geometry><mesh filename="box.dae"/></geometry></collision>'
+        joint = FIXED.format(name="j", child="end")
+        tree = load_urdf(self.urdf(f'<link name="end">{shape}</link>', joint))
+        vertices = np.asarray(tree.link("end").collisions[0].geometry.vertices)
+        assert_allclose(np.ptp(vertices, axis=0), (0.1, 0.2, 0.3))
+
     def test_shapes_and_defaults(self):
         origin = f'<origin xyz="1 2 3" rpy="0 0 {np.pi / 2}"/>'
         shapes = (

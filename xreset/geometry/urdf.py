@@ -581,7 +581,10 @@ def _mesh_hull(mesh: yourdfpy.Mesh, link: str, path: Path) -> Geometry:
             f"link {link!r} uses the mesh {shown(name)}, which is not in its folders. Put it there."
         )
     try:
-        vertices = np.asarray(load_mesh(file).vertices)
+        solid = load_mesh(file)
+        if file.suffix.lower() == ".dae" and solid.units:  # Collada states its unit, as ROS reads it
+            solid.convert_units("meters")
+        vertices = np.asarray(solid.vertices)
         if not (np.abs(vertices) < _LARGEST).all():
             raise ObjectError("a vertex is not finite, or too far away")
         scale = 1.0 if mesh.scale is None else np.asarray(mesh.scale, dtype=float)

@@ -18,9 +18,9 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from xreset.files.checks import frozen
-from xreset.geometry.shapes import transform, transformed
+from xreset.geometry.shapes import transform, transformed, turn_of
 from xreset.geometry.surface import Surface
-from xreset.objects.rest import resting_faces
+from xreset.objects.rest import rest_height, resting_faces
 from xreset.spec import TableSpec
 
 MOVED = 0.05
@@ -152,30 +152,35 @@ class Recording:
     @cached_property
     def start_height(self) -> float:
         """Height of the object's lowest vertex in the first frame, or of its origin if its mesh is unknown [m]."""
-        return float(self.pos[0, 2]) if self.surface is None else self._lowest(0)
+        return float(self._lowest(0))
 
     @cached_property
     def least_height(self) -> float:
         """The same in any of some frames [m]."""
-        if self.surface is None:
-            return float(self.pos[:, 2].min())
-        frames = np.linspace(0, len(self.pos) - 1, _LOOKS).astype(int)
-        return min(self._lowest(frame) for frame in np.unique(frames).tolist())
+        frames = slice(None)
+        if self.surface is not None:
+            frames = np.linspace(0, len(self.pos) - 1, _LOOKS).astype(int)
+        return float(np.min(self._lowest(frames)))
 
-    def _lowest(self, frame: int) -> float:
-        """Return the height of the object's lowest vertex in a frame [m]."""
-        assert self.surface is not None
-        up = self.matrix[frame, 2]
-        return float(self.pos[frame, 2] + (self.surface.obj.vertices @ up).min())
+    def _lowest(self, frames: int | slice | np.ndarray) -> np.ndarray | float:
+        """Return the height of the object's lowest vertex in frames [m], or of its origin."""
+        height = self.pos[frames, 2]
+        if self.surface is None:
+            return height
+        quats = self.turn.as_quat(scalar_first=True)
+        return height - rest_height(self.surface.obj, quats[frames])
 
     @cached_property
     def distances(self) -> np.ndarray:
         """[M, 21] distances of the keypoints from the object's surface, negative inside, or from its origin if its mesh
         is unknown, in the M frames with a hand in which the object has moved [m]."""
-        local = self.in_object[self.moved & self.seen]
+        return self._distances_of(self.in_object[self.moved & self.seen])
+
+    def _distances_of(self, points: np.ndarray) -> np.ndarray:
+        """[..., 21] distances of points [..., 21, 3] in the object's frame from its surface, or from its origin."""
         if self.surface is None:
-            return np.linalg.norm(local, axis=2)
-        return self.surface.signed_distance(local)
+            return np.linalg.norm(points, axis=2)
+        return self.surface.signed_distance(points)
 
     @cached_property
     def grip(self) -> tuple[float, float, float]:
@@ -210,10 +215,7 @@ class Recording:
     def nearest(self) -> float:
         """Least distance of a keypoint from the object's surface, or from its origin if its mesh is unknown, in any
         frame with a hand [m]."""
-        local = self.in_object[self.seen]
-        if self.surface is None:
-            return float(np.linalg.norm(local, axis=2).min())
-        return float(self.surface.signed_distance(local).min())
+        return float(self._distances_of(self.in_object[self.seen]).min())
 
     @cached_property
     def matrix(self) -> np.ndarray:
@@ -480,6 +482,11 @@ def _placed(r: Recording, hand: np.ndarray | None, obj: np.ndarray | None) -> Re
     return replace(r, points=points, pos=pos, turn=turn)
 
 
+def _in_own_frame(r: Recording) -> Recording:
+    """Return a recording with the object's poses as the recording states them, in its own frame."""
+    return _placed(r, None, np.linalg.inv(r.T_table))
+
+
 def _cameras(r: Recording) -> Iterator[Cause]:
     """Yield errors of the camera's pose, and of what it was applied to."""
     if r.camera is None:
@@ -554,38 +561,37 @@ def _mirrors(r: Recording) -> Iterator[Cause]:
 
 def _orders(r: Recording) -> Iterator[Cause]:
     """Yield other orders of the numbers of the object's quaternions."""
-    to_table = Rotation.from_matrix(r.T_table[:3, :3])
-    numbers = (to_table.inv() * r.turn).as_quat(scalar_first=True)
+    own = _in_own_frame(r)
+    numbers = own.turn.as_quat(scalar_first=True)
     better = _BETTER if r.surface is None else _BETTER_TURN
     for order, shift in (("(x, y, z, w)", 1), ("(w, x, y, z)", -1)):
-        quats = np.roll(numbers, shift, axis=1)
+        turn = turn_of(np.roll(numbers, shift, axis=1))
         yield Cause(
             f"The object's quaternions may be in the order {order}: name them so.",
-            replace(r, turn=to_table * Rotation.from_quat(quats, scalar_first=True)),
+            _placed(replace(own, turn=turn), None, r.T_table),
             better,
         )
 
 
 def _inverses(r: Recording) -> Iterator[Cause]:
     """Yield inverse orientations and poses of the object."""
-    to_table = Rotation.from_matrix(r.T_table[:3, :3])
-    inverse = (to_table.inv() * r.turn).inv()
-    pos = transformed(r.pos, np.linalg.inv(r.T_table))
+    own = _in_own_frame(r)
+    inverse = own.turn.inv()
     yield Cause(
         "The object's orientations may be inverted: transpose its matrices, or negate x, y and z of its quaternions.",
-        replace(r, turn=to_table * inverse),
+        _placed(replace(own, turn=inverse), None, r.T_table),
         _BETTER_INVERSE,
     )
     yield Cause(
         "The object's poses may be inverted, those of the camera in the object's frame: invert them.",
-        replace(r, turn=to_table * inverse, pos=transformed(-inverse.apply(pos), r.T_table)),
+        _placed(replace(own, turn=inverse, pos=-inverse.apply(own.pos)), None, r.T_table),
         _BETTER_INVERSE,
     )
 
 
 def _units(r: Recording) -> Iterator[Cause]:
     """Yield other units of the object's positions."""
-    own = transformed(r.pos, np.linalg.inv(r.T_table))
+    own = _in_own_frame(r)
     for scale, unit in (
         (1e3, "a thousandth"),
         (1e-3, "a thousand times"),
@@ -597,7 +603,7 @@ def _units(r: Recording) -> Iterator[Cause]:
         yield Cause(
             f"The object's positions may be in another unit: their numbers are {unit} of what they should be. Use one"
             " unit for hand and object.",
-            replace(r, pos=transformed(scale * own, r.T_table)),
+            _placed(replace(own, pos=scale * own.pos), None, r.T_table),
         )
 
 

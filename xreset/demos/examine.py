@@ -444,10 +444,11 @@ def _doubts_of_hand(r: Recording, bones: np.ndarray) -> Iterator[Finding]:
     wrist = r.points[:, 0]
     jumps = _hand_jumps(r)
     if len(jumps):
+        far = float(np.linalg.norm(wrist[jumps[0]] - wrist[jumps[0] - 1]))
         yield _doubt(
             "jumps",
             f"The hand jumps in {len(jumps)} of {len(wrist)} frames, first in frame {jumps[0]} by"
-            f" {length_text(_step(wrist, jumps[0]))}.",
+            f" {length_text(far)}.",
             "Leave the hand's cells empty in these frames.",
         )
     yield from _doubts_of_speed(r, jumps)
@@ -626,10 +627,6 @@ def _moves(r: Recording) -> np.ndarray:
     steps = np.flatnonzero(np.diff(r.pos, axis=0).any(axis=1))
     moves[: steps.min(initial=len(moves))] = moves[steps.max(initial=-1) + 1 :] = False
     return moves
-
-
-def _step(path: np.ndarray, frame: int) -> float:
-    return float(np.linalg.norm(path[frame] - path[frame - 1]))
 
 
 def _longest_run(flags: np.ndarray) -> int:

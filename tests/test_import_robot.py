@@ -729,6 +729,10 @@ class Toy(Robots):
             self.assertEqual(len(spec.arm_indices), 7)
             # a target 2 cm inside of an object must press, although no stiffness is stated
             self.assertGreater(spec.joints[-1].drive.kp * 0.02, 10.0)
+            tree = load_urdf(spec.urdf)
+            for link in ("left_finger", "right_finger"):  # with rotors of 0.1 kg
+                before = load_urdf(described.urdf).link(link).mass
+                self.assertAlmostEqual(tree.link(link).mass, before + 0.1)
             at_start = spec.home[spec.hand_indices]
             ends = Kinematics(spec).upper.numpy()[spec.hand_indices]
             assert_allclose(at_start, 0.85 * ends, atol=1e-3, err_msg="the jaw is open at home")

@@ -582,7 +582,9 @@ def _mesh_hull(mesh: yourdfpy.Mesh, link: str, path: Path) -> Geometry:
         )
     try:
         solid = load_mesh(file)
-        if file.suffix.lower() == ".dae" and solid.units:  # Collada states its unit, as ROS reads it
+        if (
+            file.suffix.lower() == ".dae" and solid.units
+        ):  # Collada states its unit, as ROS reads it
             solid.convert_units("meters")
         vertices = np.asarray(solid.vertices)
         if not (np.abs(vertices) < _LARGEST).all():

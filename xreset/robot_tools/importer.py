@@ -41,12 +41,12 @@ from xreset.robot_tools.sources import (
 )
 from xreset.spec import RobotSpec, SceneSpec
 
-_ROTOR = 1e-3
-"""[kg m^2] Rotor inertia on the diagonal of moving hand links where none is stated: finger links alone are too light
-for a step of 1/240 s. The inertia of a link means the same in every engine, which armature does not (as in the built-in
-robots)."""
-_ROTORS = (1e-6, 0.05)
-"""[kg m^2] Rotor inertias of a hand that are believed."""
+_ROTOR = {"revolute": 1e-3, "prismatic": 0.1}
+"""[kg m^2 or kg] Rotor inertia on the diagonal of moving hand links, or mass of sliding ones, where none is stated:
+finger links alone are too light for a step of 1/240 s. The inertia of a link means the same in every engine, which
+armature does not (as in the built-in robots)."""
+_ROTORS = {"revolute": (1e-6, 0.05), "prismatic": (1e-3, 5.0)}
+"""[kg m^2 or kg] Rotor inertias of a hand that are believed."""
 _EFFORT = {
     ("hand", "revolute"): 1.0,
     ("hand", "prismatic"): 20.0,
@@ -323,17 +323,22 @@ def _with_rotors(hand: Hand, notes: list[str]) -> RobotTree:
     for link in hand.tree.links:
         joint = hand.tree.moved_by.get(link.name)
         if joint is not None and link.name in inside:
-            rotor = joint.rotor or _ROTOR
-            if not _ROTORS[0] <= rotor <= _ROTORS[1]:
+            rotor = joint.rotor or _ROTOR[joint.type]
+            least, most = _ROTORS[joint.type]
+            if not least <= rotor <= most:
                 wrong.append(f"{joint.name} ({rotor:g})")
-                rotor = _ROTOR
-            link = replace(link, inertia=link.inertia + rotor * np.eye(3))
+                rotor = _ROTOR[joint.type]
+            if joint.type == "prismatic":
+                link = replace(link, mass=link.mass + rotor)
+            else:
+                link = replace(link, inertia=link.inertia + rotor * np.eye(3))
         links.append(link)
     notes.append(
-        f"moving links of the hand carry {_ROTOR:g} kg m^2 of rotor inertia, or what the MJCF states as armature"
+        "moving links of the hand carry 0.001 kg m^2 of rotor inertia (0.1 kg where they slide), or what the MJCF "
+        "states as armature"
     )
     if wrong:
-        notes.append(f"with {_ROTOR:g} in place of an armature that no finger has: {listed(wrong)}")
+        notes.append(f"with these in place of an armature that no finger has: {listed(wrong)}")
     return replace(hand.tree, links=tuple(links))
 
 

@@ -10,7 +10,8 @@ import io
 import math
 import os
 from collections import Counter
-from dataclasses import field
+from collections.abc import Iterable
+from dataclasses import field, replace
 from functools import cached_property, lru_cache
 from itertools import chain
 from pathlib import Path
@@ -143,6 +144,11 @@ class RobotTree:
                 f"robot {self.name!r} has no {kind} {name!r}. Choose from: {', '.join(by_name)}."
             )
         return by_name[name]
+
+    def with_joints(self, joints: Iterable[Joint]) -> RobotTree:
+        """Return the tree with these joints in place of those that have the same children."""
+        changed = {joint.child: joint for joint in joints}
+        return replace(self, joints=tuple((self.above | changed).values()))
 
     def below(self, root: str) -> list[str]:
         """Return the link ``root`` and all links that it carries, parents before children."""

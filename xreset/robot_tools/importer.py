@@ -345,25 +345,24 @@ def _with_rotors(hand: Hand, notes: list[str]) -> RobotTree:
 def _with_efforts(tree: RobotTree, hand_root: str, notes: list[str]) -> RobotTree:
     """Return a tree whose driven joints have efforts that arms and hands can have."""
     inside = tree.below(hand_root)[1:]
-    joints = []
+    changed = []
     without = []
     wrong = []
-    for joint in tree.joints:
-        if joint.type != "fixed" and joint.mimic is None:
+    for joint in tree.moved_by.values():
+        if joint.mimic is None:
             group = "hand" if joint.child in inside else "arm"
             least, most = _EFFORTS[group, joint.type]
             if not joint.effort:
                 without.append(joint.name)
             elif not least <= joint.effort <= most:
                 wrong.append(f"{joint.name} ({joint.effort:g})")
-                joint = replace(joint, effort=_EFFORT[group, joint.type])
-        joints.append(joint)
+                changed.append(replace(joint, effort=_EFFORT[group, joint.type]))
     rule = "they get 50 N m (arm) or 1 N m (hand); slides 500 N or 20 N"
     if without:
         notes.append(f"no effort is stated for {listed(without)}; {rule}")
     if wrong:
         notes.append(f"efforts that such joints do not have: {listed(wrong)}; {rule}")
-    return replace(tree, joints=tuple(joints))
+    return tree.with_joints(changed)
 
 
 def _excluded(tree: RobotTree) -> tuple[tuple[str, str], ...]:

@@ -105,7 +105,7 @@ def read_mjcf(path: Path, notes: list[str]) -> RobotTree:
         if gain > 0 and kp > 0 and lever > 0:
             stated["stiffness"] = kp * lever**2
         joints[name] = replace(joints[name], **stated)
-    tree = replace(tree, joints=tuple(joints.values()))
+    tree = tree.with_joints(joints.values())
     check_tree(tree)
     return tree
 

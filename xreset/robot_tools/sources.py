@@ -219,12 +219,8 @@ def without(tree: RobotTree, children: Iterable[str]) -> RobotTree:
 
 def with_fixed(tree: RobotTree, names: Sequence[str]) -> RobotTree:
     """Return a tree in which some joints are fixed at 0."""
-    joints = []
-    for joint in tree.joints:
-        if joint.name in names:
-            joint = replace(joint, type="fixed", mimic=None)
-        joints.append(joint)
-    return replace(tree, joints=tuple(joints))
+    joints = [joint for joint in tree.joints if joint.name in names]
+    return tree.with_joints(replace(joint, type="fixed", mimic=None) for joint in joints)
 
 
 def renamed(hand: RobotTree, arm: RobotTree) -> RobotTree:
@@ -288,10 +284,7 @@ def _with_ranges(tree: RobotTree, path: str | Path, notes: list[str]) -> RobotTr
     joints = []
     fixed = []
     unlimited = []
-    for joint in tree.joints:
-        if joint.type == "fixed":
-            joints.append(joint)
-            continue
+    for joint in tree.moved_by.values():
         unit = units[joint.type]
         joint = replace(joint, lower=joint.lower * unit, upper=joint.upper * unit)
         if max(abs(joint.lower), abs(joint.upper)) > _FARTHEST[joint.type]:
@@ -309,7 +302,7 @@ def _with_ranges(tree: RobotTree, path: str | Path, notes: list[str]) -> RobotTr
         )
     if fixed:
         notes.append(f"fixed, because their limits leave no range: {listed(fixed)}")
-    return replace(tree, joints=tuple(joints))
+    return tree.with_joints(joints)
 
 
 def _at(joint: Joint, position: float) -> Joint:
@@ -324,31 +317,24 @@ def _at(joint: Joint, position: float) -> Joint:
 
 def _with_speeds(tree: RobotTree, notes: list[str]) -> RobotTree:
     """Return the tree with speeds that joints can have."""
-    joints = []
     changed = []
-    for joint in tree.joints:
-        if joint.type != "fixed" and not _SPEEDS[0] <= joint.velocity <= _SPEEDS[1]:
-            joint = replace(joint, velocity=_SPEED)
-            changed.append(joint.name)
-        joints.append(joint)
+    for joint in tree.moved_by.values():
+        if not _SPEEDS[0] <= joint.velocity <= _SPEEDS[1]:
+            changed.append(replace(joint, velocity=_SPEED))
     if changed:
+        names = listed([joint.name for joint in changed])
         notes.append(
-            f"without a speed that a joint can have: {listed(changed)}; they get {_SPEED:.2f} rad/s or m/s"
+            f"without a speed that a joint can have: {names}; they get {_SPEED:.2f} rad/s or m/s"
         )
-    return replace(tree, joints=tuple(joints))
+    return tree.with_joints(changed)
 
 
 def _with_sources(tree: RobotTree, path: str | Path, notes: list[str]) -> RobotTree:
     """Return the tree with mimic joints that follow a joint that follows nothing; a mimic joint has the limits that its
     source gives it."""
-    joints = []
-    for joint in tree.joints:
-        if joint.type == "fixed":
-            joint = replace(joint, mimic=None)
-        joints.append(joint)
-    moving = {joint.name: joint for joint in joints if joint.type != "fixed"}
-    for i, joint in enumerate(joints):
-        name = joint.name
+    moving = {joint.name: joint for joint in tree.moved_by.values()}
+    joints = [replace(joint, mimic=None) for joint in tree.joints if joint.type == "fixed"]
+    for name, joint in moving.items():
         mimic = joint.mimic
         if mimic is None:
             continue
@@ -388,8 +374,8 @@ def _with_sources(tree: RobotTree, path: str | Path, notes: list[str]) -> RobotT
                     f"{name!r} has the limits {limits} that {mimic.source!r} gives it, in place of {stated}"
                 )
             joint = replace(joint, lower=low, upper=high)
-        joints[i] = replace(joint, mimic=mimic)
-    return replace(tree, joints=tuple(joints))
+        joints.append(replace(joint, mimic=mimic))
+    return tree.with_joints(joints)
 
 
 def _with_masses(tree: RobotTree, notes: list[str]) -> RobotTree:

@@ -32,8 +32,7 @@ TASK = TaskConfig(
     distance_points=64,
 )
 SMALL = replace(CONFIG.model, initial_std=0.1)
-IMAGES = VisionConfig(cameras=(FRONT, WRIST), width=16, height=12)
-POINTS = replace(IMAGES, view="points", points=8, goal_image=True)
+SEEING = VisionConfig(cameras=(FRONT, WRIST), width=16, height=12, points=8)
 
 
 class DistillTest(WithBank):
@@ -47,10 +46,10 @@ class DistillTest(WithBank):
         )
         with redirect_stdout(io.StringIO()):
             train(cls.bank, out=cls.teacher, config=config, **OPTIONS)
-            cls.run_folder = cls.distill("images")
+            cls.run_folder = cls.distill("student")
 
     @classmethod
-    def distill(cls, name, vision=IMAGES, **changes):
+    def distill(cls, name, vision=SEEING, **changes):
         config = student_config(TASK, vision)
         ppo = replace(
             config.ppo, horizon=8, sequence_length=4, minibatch_size=16, learning_rate=3e-3
@@ -78,7 +77,7 @@ class DistillTest(WithBank):
         )
         policy = OnnxPolicy(self.run_folder / "policy.onnx")
         self.assertEqual(list(policy.contract.observation_layout), ["goal", "proprio", "view"])
-        env = self.env(IMAGES)
+        env = self.env(SEEING)
         check_contract("it", policy.contract, self.robot, env.task)
         seen = env.get_observations()
         blind = seen.clone()
@@ -98,8 +97,12 @@ class DistillTest(WithBank):
                 "it",
                 policy.contract,
                 self.robot,
-                replace(env.task, vision=replace(IMAGES, interval=1)),
+                replace(env.task, vision=replace(SEEING, interval=1)),
             )
+        layout = policy.contract.observation_layout | {"view": {"depth": 768}}
+        of_images = replace(policy.contract, observation_layout=layout)  # of version 0.3
+        with self.assertRaisesRegex(PolicyError, "another observation layout .view.depth: 768"):
+            check_contract("it", of_images, self.robot, env.task)
 
     def test_the_student_learns_the_teachers_actions_and_resumes(self):
         errors = []
@@ -108,7 +111,7 @@ class DistillTest(WithBank):
             errors.append(scalars["loss/behavior"])
 
         with quickly(), patch("xreset.learning.runner.TrainingLog.write", note):
-            out = self.distill("points", POINTS, iterations=15, save_interval=100)
+            out = self.distill("longer", iterations=15, save_interval=100)
             before = read_checkpoint(latest_checkpoint(out))
             train(out=out, iterations=20)
             after = read_checkpoint(latest_checkpoint(out))
@@ -120,16 +123,15 @@ class DistillTest(WithBank):
             steps.append(max(int(state["step"]) for state in states))
         self.assertEqual(20 * steps[0], 15 * steps[1], "the optimizer went on")
 
-    def test_students_see_points_and_the_goal_by_default(self):
+    def test_cameras_of_a_student(self):
         vision = config_of_student("many-objects").task.vision
-        self.assertEqual((vision.view, vision.goal_image), ("points", True))
         self.assertEqual(vision.cameras, (FRONT,))
         for cameras in ("wrist", WRIST, ("wrist",)):
             vision = config_of_student("many-objects", cameras).task.vision
             self.assertEqual(vision.cameras, (WRIST,))
 
     def test_refusals(self):
-        away = replace(IMAGES, cameras=(replace(FRONT, target=(3.0, 0.2, 0.5)),))
+        away = replace(SEEING, cameras=(replace(FRONT, target=(3.0, 0.2, 0.5)),))
         two = {"teacher": self.teacher, "bank": self.bank, "out": self.folder / "refused"}
         for error, words, options in (
             (
@@ -143,7 +145,7 @@ class DistillTest(WithBank):
             (
                 PolicyError,
                 "sees through cameras itself",
-                {"teacher": self.run_folder, "config": student_config(TASK, IMAGES)},
+                {"teacher": self.run_folder, "config": student_config(TASK, SEEING)},
             ),
         ):
             with quickly(), refuses(self, words, error):
@@ -174,7 +176,7 @@ class DistillTest(WithBank):
         for options, problem in (
             ("", ""),
             ("--camera front", "continues as it was started. Omit cameras"),
-            ("--config.task.vision.view points", "Omit config"),
+            ("--config.task.vision.points 64", "Omit config"),
             # the default, which is not what the run was started with
             ("--num-envs 1024", "Omit num_envs"),
             ("--teacher many-objects", "Omit teacher"),

@@ -493,6 +493,8 @@ class ConfigTest(TestCase):
                 "reset": reset,
                 "termination": ends,
                 "randomization": {"friction_buckets": 250},
+                "action": {"hand_smoothing": 1.0, "hand_zero": "middle"},
+                "vision": {"view": "depth", "goal_image": False},
             },
             "model": {"activation": "elu", "conv": [16, 32, 32]},
             "ppo": clipping | {"gae_lambda": 0.95, "schedule": "adaptive"},

@@ -279,4 +279,4 @@ def _painter(
         return partial(draw_state, Renderer(scene, size=size))
     camera = CAMERAS[video.removeprefix(_DEPTH)]
     vision = VisionConfig(cameras=(camera,), width=size[0], height=size[1])
-    return partial(draw_view, policy_cameras(scene, vision), width=size[0])
+    return partial(draw_view, policy_cameras(scene, vision), width=size[0], goal=False)

@@ -121,7 +121,9 @@ def draw_state(renderer: Renderer, trace: Trace, row: int) -> np.ndarray:
     return renderer.draw(trace.joint_pos[row], pose, goal_pose=goal)
 
 
-def draw_view(cameras: Cameras, trace: Trace, row: int, width: int) -> np.ndarray:
+def draw_view(
+    cameras: Cameras, trace: Trace, row: int, width: int, *, goal: bool = True
+) -> np.ndarray:
     """Return the images of one state of a trace that cameras of one world show, joined as by :meth:`Cameras.picture`.
 
     Args:
@@ -129,6 +131,7 @@ def draw_view(cameras: Cameras, trace: Trace, row: int, width: int) -> np.ndarra
         trace: the episode.
         row: index of the state.
         width: width of the joined image [pixels].
+        goal: whether the object at its goal is shown.
     """
     now = (
         trace.joint_pos[row],
@@ -146,7 +149,7 @@ def draw_view(cameras: Cameras, trace: Trace, row: int, width: int) -> np.ndarra
     cameras.aim(state, goal_pos, goal_quat, torch.ones(1, dtype=torch.bool))
     cameras.cast()
     cameras.observe(torch.Generator().manual_seed(row))
-    return cameras.picture(0, width)
+    return cameras.picture(0, width, goal=goal)
 
 
 def policy_cameras(scene: SceneSpec, vision: VisionConfig) -> Cameras:

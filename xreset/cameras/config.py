@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import field
-from typing import Annotated, Literal
+from typing import Annotated
 
 from xreset.errors import WrongValueError, XResetError
 from xreset.files.checks import (
@@ -80,7 +80,8 @@ class CameraConfig(Checked):
 
 @frozen
 class VisionConfig(Checked):
-    """What a policy sees of the object. Without cameras it is told pose and shape."""
+    """What a policy sees of the object: points of depth images in the world, without those of the table and the robot,
+    whose geometry is known. Without cameras it is told pose and shape."""
 
     cameras: tuple[CameraConfig, ...] = ()
     width: Pixels = 64
@@ -90,33 +91,24 @@ class VisionConfig(Checked):
     """Control steps from one image to the next: 2 is 30 Hz where control runs at 60 Hz."""
     latency: NonNegativeFloat = 0.0
     """Age of an image when the policy gets it [control steps], rounded to whole steps."""
-    view: Literal["depth", "points"] = "depth"
-    """``depth``: the images. ``points``: points of the images in the world, without those of the table and the robot,
-    whose geometry is known."""
     points: PositiveInt = 128
-    """Points of the view ``points``, drawn at random from the pixels."""
-    goal_image: bool = False
-    """Whether the policy also sees the object at its goal: another image for each camera, or as many points."""
+    """Points of the object that the policy sees, drawn at random from the pixels; and as many of the object at its
+    goal, as the same cameras would see it."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         pixels = len(self.cameras) * self.width * self.height
-        if self.view == "points" and 0 < pixels < self.points:
+        if 0 < pixels < self.points:
             raise WrongValueError(
                 f"points is {self.points}, expected at most {pixels}, one for each pixel"
             )
 
     @property
     def view_shape(self) -> tuple[int, int, int]:
-        """Shape of one world's view: images, height, width; or clouds, points, coordinates and 1 (0: no point)."""
-        views = 2 if self.goal_image else 1
-        if self.view == "depth":
-            return views * len(self.cameras), self.height, self.width
-        return views, self.points, 4
+        """Shape of one world's view: the object and its goal; points; coordinates and 1 (0: no point)."""
+        return 2, self.points, 4
 
 
-STUDENT_VISION = VisionConfig(view="points", goal_image=True)
-"""What a student of :func:`xreset.train` sees unless it is told otherwise, but for its cameras."""
 FRONT = CameraConfig()
 """A camera in front of the table, opposite the robot."""
 SIDE = CameraConfig(pos=(0.55, -0.45, 0.55), target=(0.55, 0.22, 0.18))

@@ -83,9 +83,7 @@ class Cameras:
         self._due = torch.ones(worlds, dtype=torch.bool, device=device)
         views = (self.pose, self._tangent, self._due, size)
         self.rays = RayCaster(surfaces, torch.cat((fixed, held), dim=1), *views)
-        self._goal_rays: RayCaster | None = None
-        if config.goal_image:
-            self._goal_rays = RayCaster(objects, object_index[:, None], *views)
+        self._goal_rays = RayCaster(objects, object_index[:, None], *views)
         limits = tensor([(c.near, c.far) for c in config.cameras])
         self._near, self._far = limits.T[..., None, None]
         noise = tensor([astuple(c.noise) for c in config.cameras])
@@ -126,49 +124,36 @@ class Cameras:
         self.pose.copy_(self._believed @ moved)
         self._tangent.copy_((self.fov_scale * self._half_fov).tan())
         self._due.copy_(due)
-        if self._goal_rays is not None:
-            self._goal_rays.pose[:, 0] = homogeneous(quat_to_matrix(goal_quat), goal_pos)
+        self._goal_rays.pose[:, 0] = homogeneous(quat_to_matrix(goal_quat), goal_pos)
 
     def cast(self) -> None:
         """Draw the images of the worlds that are due."""
         self.rays.cast()
-        if self._goal_rays is not None:
-            self._goal_rays.cast()
+        self._goal_rays.cast()
 
     def observe(self, generator: torch.Generator) -> Tensor:
-        """[N, ...] what the newest images show: :attr:`VisionConfig.view_shape`.
-
-        Depths are 1 at the camera's least depth, 0 at its largest one, and 0 where a pixel sees nothing.
-        """
+        """[N, ...] points that the newest images show: :attr:`VisionConfig.view_shape`."""
         measured = self._with_errors(self.rays.depth, generator)
         self.image.copy_(where(self._due, measured, self.image))
-        images = [self.image]
-        if self._goal_rays is not None:
-            images.append(self._in_range(self._goal_rays.depth))
-        if self.config.view == "depth":
-            view = torch.cat([self._nearness(image) for image in images], dim=1)
-        else:
-            is_object = [self._on_object(), images[-1] > 0]
-            clouds = []
-            for image, mask in zip(images, is_object, strict=False):
-                clouds.append(self._points(image, mask, generator))
-            view = torch.stack(clouds, dim=1)
-        self.view.copy_(where(self._due, view, self.view))
+        goal = self._in_range(self._goal_rays.depth)
+        present = self._points(self.image, self._on_object(), generator)
+        wanted = self._points(goal, goal > 0, generator)
+        self.view.copy_(where(self._due, torch.stack((present, wanted), dim=1), self.view))
         return self.view
 
-    def picture(self, world: int, width: int) -> np.ndarray:
+    def picture(self, world: int, width: int, *, goal: bool = True) -> np.ndarray:
         """Return the newest images of a world side by side, [h, width, 3] uint8: near is bright, nothing is black.
-
-        The object at its goal is green, if the policy sees it.
 
         Args:
             world: index of the world.
             width: width of the picture in pixels; its height is even.
+            goal: whether the object at its goal is shown, in green.
         """
         images = self.image[world]
-        near = torch.where(images > 0, 0.2 + 0.8 * self._nearness(images), 0.0)
+        nearness = (self._far - images) / (self._far - self._near)
+        near = torch.where(images > 0, 0.2 + 0.8 * nearness, 0.0)
         colors = near[..., None].repeat(1, 1, 1, 3)
-        if self._goal_rays is not None:
+        if goal:
             at_goal = self._in_range(self._goal_rays.depth)[world] > 0
             colors[at_goal] = 0.5 * (colors[at_goal] + colors.new_tensor(_GOAL_COLOR))
         pixels = Image.fromarray((255 * torch.cat(tuple(colors), dim=1)).byte().cpu().numpy())
@@ -218,10 +203,6 @@ class Cameras:
     def _on_object(self) -> Tensor:
         """[N, C, H, W] bool: whether a pixel's ray hits the object, which is a world's last body."""
         return self.rays.body == self.rays.pose.shape[1] - 1
-
-    def _nearness(self, depth: Tensor) -> Tensor:
-        """[..., C, H, W] 1 at a camera's least depth, 0 at its largest one, and 0 where a pixel sees nothing."""
-        return torch.where(depth > 0, (self._far - depth) / (self._far - self._near), 0.0)
 
     def _in_range(self, depth: Tensor) -> Tensor:
         return torch.where((depth >= self._near) & (depth <= self._far), depth, 0.0)

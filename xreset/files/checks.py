@@ -397,7 +397,8 @@ def _parsed_record(cls: type, data: Any, where: str, problems: list[str]) -> Any
     data = renamed(cls, data)
     removed = REMOVED.get(cls.__name__, {})
     for name in sorted(data.keys() & removed.keys()):
-        if data[name] != removed[name]:
+        kept = removed[name] if isinstance(removed[name], tuple) else (removed[name],)
+        if data[name] not in kept:
             problems.append(
                 f"{where}.{name} is {shown(data[name])}. This option was removed; only {removed[name]!r} can be read. "
                 "Use an earlier version of xreset."

@@ -45,6 +45,9 @@ REMOVED: dict[str, dict[str, Any]] = {
     "Evaluation": {"unseen": False},
     "EvalResult": {"measured": {}},
     "Runs": {"evaluations": [], "gpus": 1},
+    # a student that saw something else has another layout of observations, with which it is refused
+    "VisionConfig": {"view": ("points", "depth"), "goal_image": (True, False)},
     "TableSpec": {"rows": "object", "object": None},
 }
-"""Data class -> option -> the value that means what is done now. Files with another value are refused."""
+"""Data class -> option -> the value that means what is done now, or a tuple of values. Files with another value are
+refused."""

@@ -1,6 +1,6 @@
 """The paper's network (appendix C, Table VIII): PointNet per cloud frame, LSTM with layer norm, MLP.
 
-Observation groups with two dimensions are flat; groups with four, [N, H, P, K], are cloud histories, or images. Shape
+Observation groups with two dimensions are flat; groups with four, [N, H, P, K], are cloud histories. Shape
 letters: N worlds (or sequences), T steps of a rollout, L steps of a sequence, H history, P points, K numbers per point,
 D flat width; ``embedding`` and ``lstm`` are the widths of a frame's embedding and of the LSTM.
 """
@@ -24,11 +24,9 @@ from xreset.learning.distributed import Processes
 
 with needs("rsl-rl-lib", "train"):
     from rsl_rl.models import MLPModel
-    from rsl_rl.modules import CNN, EmpiricalNormalization, HiddenState
+    from rsl_rl.modules import EmpiricalNormalization, HiddenState
     from rsl_rl.modules.distribution import GaussianDistribution
 
-CONV = (16, 32, 32)
-"""Channels of the convolutions for depth images, each of which halves the image."""
 CLIP_OBSERVATIONS = 5.0
 """Limit of normalized observations in policies for several robots. An observation that is constant in the training,
 such as an empty slot, has almost no deviation: in another robot, its value may be a hundred deviations away."""
@@ -63,36 +61,7 @@ class PointNet(nn.Module):
             return self.mlp(cloud).amax(dim=-2).float()
 
 
-class ImageEncoder(nn.Module):
-    """Embeds images [..., C, H, W] as [..., 1, embedding]: convolutions that halve the image, then one linear layer."""
-
-    def __init__(self, shape: Sequence[int], channels: Sequence[int], embedding: int) -> None:
-        """Build for images of a shape (C, H, W)."""
-        super().__init__()
-        kernels = [5, *[3] * (len(channels) - 1)]
-        count, height, width = shape
-        self.cnn = CNN(
-            (height, width),
-            count,
-            list(channels),
-            kernel_size=kernels,
-            stride=2,
-            padding="zeros",
-            activation="elu",
-        )
-        features = self.cnn.output_dim
-        assert isinstance(features, int), "a flattened output has one width"
-        self.linear = nn.Linear(features, embedding)
-        self.use_bfloat16 = False
-        """Not used: images are embedded in the precision of the rest."""
-
-    def forward(self, images: Tensor) -> Tensor:
-        """[..., C, H, W] -> [..., 1, embedding]."""
-        embedded = self.linear(self.cnn(images.flatten(0, -4)))
-        return embedded.unflatten(0, images.shape[:-3])[..., None, :]
-
-
-def embed_sequences(pointnet: PointNet | ImageEncoder, cloud: Tensor, first: Tensor) -> Tensor:
+def embed_sequences(pointnet: PointNet, cloud: Tensor, first: Tensor) -> Tensor:
     """Return embeddings [L, N, H, embedding] of cloud histories [L, N, H, P, K]; every distinct frame is embedded once.
 
     A step's history is that of the step before, shifted by one, with the newest frame at the end. Where an episode
@@ -160,7 +129,7 @@ class Trunk(nn.Module):
     def __init__(
         self,
         flat_dim: int,
-        pointnet: PointNet | ImageEncoder,
+        pointnet: PointNet,
         embedding_dim: int,
         lstm_dim: int,
         *,
@@ -170,7 +139,7 @@ class Trunk(nn.Module):
 
         Args:
             flat_dim: D.
-            pointnet: encoder of clouds or images.
+            pointnet: encoder of clouds.
             embedding_dim: width of all embeddings of a step.
             lstm_dim: units of the LSTM.
             clip: whether normalized observations are limited to +-:data:`CLIP_OBSERVATIONS`.
@@ -238,7 +207,6 @@ class PointNetLstmModel(MLPModel):
         output_dim: int,
         config: ModelConfig,
         *,
-        conv: Sequence[int] = (),
         stochastic: bool = False,
         clip: bool = False,
     ) -> None:
@@ -246,10 +214,9 @@ class PointNetLstmModel(MLPModel):
 
         Args:
             obs: an example of the observations.
-            groups: flat groups of the observations, then the group of clouds or images.
+            groups: flat groups of the observations, then the group of clouds.
             output_dim: number of outputs.
             config: widths of the layers.
-            conv: channels of the convolutions for images; empty: the last group has clouds.
             stochastic: whether the outputs are the means of a Gaussian.
             clip: as for :class:`Trunk`.
         """
@@ -264,14 +231,9 @@ class PointNetLstmModel(MLPModel):
             config.mlp,
             distribution_cfg=gaussian if stochastic else None,
         )
-        shape = obs[self.cloud_group].shape[1:]
-        width = config.pointnet[-1]
-        encoder: PointNet | ImageEncoder
-        if conv:
-            encoder = ImageEncoder(shape, conv, width)
-        else:
-            encoder = PointNet(config.pointnet, shape[2])
-            width *= shape[0]
+        clouds, _, point_width = obs[self.cloud_group].shape[1:]
+        encoder = PointNet(config.pointnet, point_width)
+        width = clouds * config.pointnet[-1]
         self.trunk = Trunk(self.obs_dim, encoder, width, config.lstm, clip=clip)
         self.state: LstmState | None = None
 
@@ -321,7 +283,7 @@ class PointNetLstmModel(MLPModel):
         return trunk.norm(out).unflatten(1, (pieces, -1)).transpose(0, 1).flatten(0, 1)
 
     def _embed_rollout(self, cloud: Tensor, first: Tensor) -> Tensor:
-        """Return embeddings [T, N, H, embedding] of clouds [T, N, H, P, K] or images in an update."""
+        """Return embeddings [T, N, H, embedding] of clouds [T, N, H, P, K] in an update."""
         if self.cloud_group == "view":  # what cameras show is not shifted from step to step
             return self.trunk.pointnet(cloud)
         return embed_sequences(self.trunk.pointnet, cloud, first)
@@ -424,14 +386,11 @@ class ExportedPolicy(nn.Module):
 
 def make_actor(obs: TensorDict, num_actions: int, config: TrainConfig) -> PointNetLstmModel:
     """Return a new actor; ``obs`` is an example of the observations."""
-    vision = config.task.vision
-    conv = CONV if vision.cameras and vision.view == "depth" else ()
     actor = PointNetLstmModel(
         obs,
         config.task.policy_groups,
         num_actions,
         config.model,
-        conv=conv,
         stochastic=True,
         clip=config.task.joint_slots is not None,
     )

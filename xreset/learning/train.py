@@ -15,7 +15,6 @@ import torch
 
 from xreset.cameras.config import (
     CAMERAS,
-    STUDENT_VISION,
     CameraConfig,
     VisionConfig,
     camera_of,
@@ -212,8 +211,7 @@ def config_of_student(
     """
     wanted = [cameras] if isinstance(cameras, str | CameraConfig) else cameras
     chosen = tuple(map(camera_of, wanted))
-    vision = replace(STUDENT_VISION, cameras=chosen)
-    return student_config(read_policy(teacher).contract.task, vision)
+    return student_config(read_policy(teacher).contract.task, VisionConfig(cameras=chosen))
 
 
 def bank_or_goals(

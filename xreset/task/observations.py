@@ -434,7 +434,7 @@ def layout(
 
     if vision is None or not vision.cameras:
         return {group: widths(group) for group in ("policy", "proprio", "perception")}
-    view = {vision.view: prod(vision.view_shape)}
+    view = {"points": prod(vision.view_shape)}
     return {"goal": widths("goal"), "proprio": widths("proprio"), "view": view}
 
 

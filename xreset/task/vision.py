@@ -89,8 +89,7 @@ class Vision:
             )
 
     def observe(self, fresh: Tensor, generator: torch.Generator) -> Tensor:
-        """[N, ...] images or points that the policy observes, of shape
-        :attr:`~xreset.cameras.config.VisionConfig.view_shape`.
+        """[N, ...] points that the policy observes, of shape :attr:`~xreset.cameras.config.VisionConfig.view_shape`.
 
         In the ``fresh`` worlds [N] the present view becomes the whole past.
         """

@@ -7,7 +7,6 @@ from hashlib import blake2b
 from typing import Literal
 
 import numpy as np
-from scipy.spatial import ConvexHull
 
 from xreset.geometry.shapes import turn_of, winding_number
 from xreset.spec import ObjectSpec
@@ -94,11 +93,9 @@ def bounding_box(obj: ObjectSpec) -> tuple[np.ndarray, np.ndarray]:
 def center(obj: ObjectSpec) -> np.ndarray:
     """[3] center of volume of the object's convex hull: defined for any mesh, and independent of its origin, axes and
     triangles."""
-    hull = ConvexHull(obj.vertices)
-    inside = hull.points[hull.vertices].mean(axis=0)
-    corners = hull.points[hull.simplices] - inside
-    volumes = np.abs(np.linalg.det(corners))
-    return inside + volumes @ corners.sum(axis=1) / (4 * volumes.sum())
+    from trimesh.convex import convex_hull  # slow to import
+
+    return np.asarray(convex_hull(obj.vertices).center_mass)
 
 
 def centers_of_mass(

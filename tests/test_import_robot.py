@@ -195,6 +195,11 @@ class Toy(Robots):
         self.assertEqual(spec.home[spec.arm_indices].tolist(), [0.1235] * 6)
         # 15 times the effort are 4500, the most is 2000, and the step of the engines allows this
         self.assertEqual(spec.joints[0].drive.kp, 1560)
+        rail = ARM.replace('type="revolute"', 'type="prismatic"', 1)
+        made = make_robot(
+            self.file("rail.urdf", rail), self.file("hand.urdf", HAND), self.folder / "rail"
+        )
+        self.assertEqual(load_robot(made.folder).joints[0].drive.kp, 60 / 0.05)
         self.assertIn(
             "ok", [finding.level for finding in check(folder) if finding.topic == "drives"]
         )

@@ -61,7 +61,7 @@ _EFFORTS = {
     ("arm", "prismatic"): (20.0, 30_000.0),
 }
 """[N m or N] Effort limits that are believed."""
-_SLIDE = 0.02
+_SLIDE = {"hand": 0.02, "arm": 0.05}
 """[m] Way of a sliding joint's target beyond the joint that asks for its whole effort."""
 _STABLE = {"hand": 0.8, "arm": 0.3}
 """Share of the largest kp that is stable in engines that integrate drives explicitly: kd times the step stays below the
@@ -408,8 +408,8 @@ def _with_free_spread(spec: RobotSpec, notes: list[str]) -> RobotSpec:
 def _with_drives(spec: RobotSpec, tree: RobotTree, notes: list[str]) -> RobotSpec:
     """Return the robot with drives as the files state them, else by the built-in robots' rule.
 
-    The rule: stiff enough that the effort is reached within 0.35 rad or 2 cm, and not too stiff for the step of the
-    engines.
+    The rule: stiff enough that the effort is reached within 0.35 rad, 2 cm (hand) or 5 cm (arm), and not too stiff for
+    the step of the engines.
     """
     joints = []
     softer = []
@@ -418,7 +418,7 @@ def _with_drives(spec: RobotSpec, tree: RobotTree, notes: list[str]) -> RobotSpe
         effort = stated.effort or _EFFORT[joint.group, stated.type]
         factor = 2.0 if joint.group == "arm" else 1.8
         if stated.type == "prismatic":
-            kp = effort / _SLIDE
+            kp = effort / _SLIDE[joint.group]
         elif joint.group == "arm":
             kp = float(np.clip(effort * 15, 300, 2000))
         else:

@@ -1,9 +1,8 @@
 """learning: whether a small training learns as it did, as JSON with the stored band (ci/learning.json); exit status 1 if it does not.
 
 A gripper takes a brick between its jaws and lifts it (tests/toy_learning.py), in the default task without random
-properties, or with --task small in the one of the tests (60 Hz, one cloud). --device cpu: MuJoCo, 60 iterations, 40
-seconds. --device cuda: mujoco-warp, the paper's networks in bfloat16, as many iterations on every GPU; three minutes
-with compiling.
+properties. --device cpu: MuJoCo, 60 iterations, 40 seconds. --device cuda: mujoco-warp, the paper's networks in
+bfloat16, as many iterations on every GPU; three minutes with compiling.
 """
 
 from __future__ import annotations
@@ -28,17 +27,15 @@ _GPU_ITERATIONS = 200
 
 def add_arguments(group: argparse._ArgumentGroup) -> None:
     group.add_argument("--seed", type=int, default=0)
-    group.add_argument("--task", choices=("default", "small"), default="default")
 
 
 def run(options: Options, console: Console) -> None:
     sys.path.append(str(BAND.parents[1]))  # for tests/, behind an installed xreset
-    from tests.toy_learning import CONFIG, RECIPE, WORLDS, scene, trained
+    from tests.toy_learning import RECIPE, WORLDS, scene, trained
 
     seed = int(str(options.extra["seed"]))
     gpu = options.device.startswith("cuda")
-    task = str(options.extra["task"])
-    config = CONFIG if task == "small" else RECIPE
+    config = RECIPE
     if gpu:
         ppo = replace(config.ppo, minibatch_size=8192, precision="bfloat16")
         config = replace(
@@ -56,7 +53,7 @@ def run(options: Options, console: Console) -> None:
         began = time.perf_counter()
         figures, steps = trained(seed, backend, config)
     figures = figures | {"env_steps": steps, "seconds": round(time.perf_counter() - began, 1)}
-    kind = f"{options.device.partition(':')[0]} {task}"
+    kind = options.device.partition(":")[0]
     band: dict[str, list[float]] | None = json.loads(BAND.read_text()).get(kind)
     outside = [
         name for name, (low, high) in (band or {}).items() if not low <= figures[name] <= high

@@ -193,14 +193,6 @@ class UsageTest(TestCase):
                 r"--out is given more than once. Give the command once for each file",
                 "view x.npz --out x.png --out x.mp4",
             ),
-            (
-                r"--out is d\.npz, which the command reads\. Nothing was overwritten",
-                "retarget d.npz --robot openarm --out ./d.npz",
-            ),
-            (
-                r"--out is d\.npz, which the command reads",
-                "demos select c.npz d.npz --out ./d.npz",
-            ),
             (r"--out is empty\. Is a variable of the shell not set", "run d.npz --out="),
             (r"--host is empty\.", "view d.npz --host ''"),
             (r"An argument is empty\.", "policies ''"),
@@ -543,6 +535,15 @@ class OutputTest(InFolder):
         empty.touch()
         for out in (empty, empty, demos):  # of its own kind
             succeeds("demos synth --objects soup --per-object 1 --out", out)
+
+    def test_an_input_is_not_overwritten_and_a_name_is_no_input(self):
+        file = self.folder / "d.npz"
+        file.touch()
+        words = f"--out is {file}, which the command reads. Nothing was overwritten"
+        for command in (f"retarget {file} --robot openarm", f"demos select c.npz {file}"):
+            self.assertIn(words, refused(command, "--out", file))
+        said = refused("eval ik --robot openarm --demos none.npz --out ik")
+        self.assertIn("there is no none.npz", said)
 
     def test_a_read_only_folder_is_refused_at_once(self):
         with patch("xreset.files.checks.os.access", return_value=False):

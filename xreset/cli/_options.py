@@ -302,7 +302,9 @@ def _check_overwriting(options: list[_Option]) -> None:
             several = isinstance(other.value, list | tuple)
             files = other.value if several else [other.value]
             paths = [file.resolve() for file in files if isinstance(file, Path)]
-            if other is not option and option.value.resolve() in paths:
+            # what is not there is a name, such as that of a policy
+            is_file = other.is_written or option.value.exists()
+            if other is not option and is_file and option.value.resolve() in paths:
                 use = f"is {other.flag} as well" if other.is_written else "the command reads"
                 raise XResetError(
                     f"{option.flag} is {option.value}, which {use}. Nothing was overwritten; choose another file."

@@ -74,12 +74,31 @@ class Run(InFolder, TestCase):
                 words = ("run", demos, "--engine mujoco --robot", robot, "--out", self.folder / "a")
                 said = xreset_command(*words)[1]
             self.assertEqual("of another robot are not known" not in said, is_known, said)
-            self.assertNotIn("--weights", said, "no policy of this robot learns on")
-        with patch.object(command, "_step", side_effect=KeyboardInterrupt):
-            said = xreset_command(
-                "run", demos, "--robot ur7e-sharpa --engine mujoco --out", own / "b"
-            )[1]
-        self.assertIn("--weights many-objects --minutes 7", said)
+
+    def test_training_starts_from_the_policy_that_ships(self):
+        write_demos(self.folder / "soup.npz", synthesize(["soup"], 1, fps=5))
+        on = {"weights": "many-objects", "minutes": 7.0}
+        anew = {"weights": None, "minutes": 25.0}
+        for robot, options, expected in (
+            ("ur7e-sharpa", {}, on),
+            ("ur7e-sharpa", {"iterations": 5}, on | {"minutes": None}),
+            ("ur7e-sharpa", {"weights": "none"}, anew),
+            ("ur7e-sharpa", {"recipe": "any_object"}, anew),
+            ("openarm", {}, anew),
+        ):
+            with (
+                self.subTest(robot=robot, options=options),
+                patch.object(command, "file_hash", return_value="0"),
+                patch.object(command, "_made_from", return_value=True),
+                patch.object(command, "_step", side_effect=KeyboardInterrupt) as step,
+                self.assertRaises(KeyboardInterrupt),
+            ):
+                out = self.folder / "out"
+                xreset.run(
+                    self.folder / "soup.npz", robot=robot, out=out, engine="mujoco", **options
+                )
+            given = step.call_args.kwargs
+            self.assertEqual({name: given[name] for name in expected}, expected)
 
     def test_nothing_is_made_if_a_later_step_would_refuse(self):
         demos = self.folder / "soup.npz"

@@ -21,7 +21,8 @@ from xreset.physics.plugins import Device, backend_class, robot_names
 from xreset.policy.shipped import shipped_checkpoints, shipped_name
 
 _MINUTES = 25.0
-"""Length of the training where nothing else is said."""
+_MINUTES_ON = 7.0
+"""Length of the training where nothing else is said: from new networks, and from those of a policy that has learned."""
 _RETARGET = 0.025
 _RESETS = 0.038
 """Seconds of one core to retarget a frame, and to make the bank's states of a frame: the longest of the six robots that
@@ -62,10 +63,12 @@ def run(
         engine: physics engine to evaluate in, or several; default: all that can be used here.
         recipe: recipe of the training, or another run's folder; default: the recipe of the headline results, or that
             of the weights.
-        weights: run with whose networks the training starts, or many-objects, as in xreset train.
+        weights: run or policy with whose networks the training starts, as in xreset train; none for new ones. Default:
+            the policy that ships for the robot, if it has a checkpoint and no recipe is given.
         device: where to train: cpu or cuda; default: cuda where there is a GPU.
         num_envs: worlds of the training.
-        minutes: time of the whole training, without compiling kernels; default: 25, unless iterations are given.
+        minutes: time of the whole training, without compiling kernels; default: 25, or 7 with weights, unless
+            iterations are given.
         iterations: iterations of the whole training.
         seed: seed of the training and of the evaluations' starts.
         episodes: episodes of each demonstration in each engine.
@@ -87,6 +90,7 @@ def run(
     # what the last steps would refuse, after minutes of work; engines last, because they take seconds to load
     archive = read_demos(demos)
     spec = load_robot(robot)
+    weights = _weights(weights, recipe, robot)
     config = starting_config(str(recipe or weights or "default"))
     task = config.task
     if weights is not None:
@@ -98,7 +102,7 @@ def run(
     engines = quick_engines(named, "cpu")
     backend_class(ENGINE).engine_version()
     if minutes is None and iterations is None:
-        minutes = _MINUTES
+        minutes = _MINUTES if weights is None else _MINUTES_ON
     console.print(
         f"{quantity(archive.num_sequences, 'demonstration')}, {quantity(archive.num_frames, 'frame')}; engines: "
         f"{', '.join(engines)}"
@@ -108,11 +112,9 @@ def run(
         console.print(line)
     if str(robot) not in robot_names():
         console.print("These are times of robots that ship; those of another robot are not known.")
-    known = shipped_name(str(robot))
-    if recipe is None and weights is None and known in shipped_checkpoints():
+    if weights is not None:
         console.print(
-            f"The training can start from what {known} knows. It is then shorter, and better with other motion: "
-            f"--weights {known} --minutes 7"
+            f"The training starts from the networks of {weights} (--weights none: from new ones)."
         )
     motion = out / "motion.npz"
     bank = out / "resets.npz"
@@ -149,6 +151,22 @@ def run(
         named = [f"--engine={name}" for name in left]
         _step("eval", out, *named, demos=demos, episodes=episodes, seed=seed, meshes=meshes)
     _step("report", out, meshes=meshes)
+
+
+def _weights(
+    weights: str | Path | None, recipe: str | None, robot: str | Path
+) -> str | Path | None:
+    """Return whose networks the training starts with; None: new ones.
+
+    Args:
+        weights: as in ``run``.
+        recipe: as in ``run``: its networks may be others than those of the policy that ships.
+        robot: name or folder of the robot.
+    """
+    if weights is not None:
+        return None if str(weights) == "none" else weights
+    known = shipped_name(str(robot))
+    return known if recipe is None and known in shipped_checkpoints() else None
 
 
 def _times(

@@ -119,14 +119,15 @@ class RewardTest(TestCase):
             "palm_distance": 0.2,
             "points": torch.zeros(4, 3),
             "is_arm": [True, True, False, False],
-            "success_position": 0.02,
         }
+        success_position = changes.pop("success_position", 0.02)
         for name in ("object", "goal", "start"):
             x |= {f"{name}_pos": [0.5, 0.3, 0.1], f"{name}_quat": IDENTITY}
         x = {name: torch.as_tensor(value) for name, value in (x | changes).items()}
-        x = {k: v if k in ("is_arm", "success_position") else v[None] for k, v in x.items()}
+        x = {k: v if k == "is_arm" else v[None] for k, v in x.items()}
         state = State.at_rest(torch.zeros(1, 4), x.pop("object_pos"), x.pop("object_quat"))
-        return RewardFunction(config or RewardConfig())(RewardInput(state=state, **x))
+        x = RewardInput(state=state, success_position=success_position, **x)
+        return RewardFunction(config or RewardConfig())(x)
 
     def assert_terms(self, reward, **expected):
         """The named terms have these values, every other term is zero, and the total is a hundredth of the sum."""

@@ -170,7 +170,6 @@ class ManipulationEnv:
             self._center = of_worlds(center)
             self._cloud_points = self._cloud_points - self._center[:, None]
             self._metric_points = self._metric_points - self._center[:, None]
-        self.success_position = torch.tensor(task.reward.success_position, device=self.device)
         self._joint_lower = self.actions.lower.nan_to_num(neginf=-torch.pi)
         self._joint_upper = self.actions.upper.nan_to_num(posinf=torch.pi)
         self._renderer: Renderer | None = None
@@ -524,7 +523,7 @@ class ManipulationEnv:
             palm_distance=self._palm_distance(reading),
             points=self._metric_points,
             is_arm=self.actions.is_arm,
-            success_position=self.success_position,
+            success_position=self.task.reward.success_position,
         )
 
     def _palm_distance(self, reading: Reading) -> Tensor:

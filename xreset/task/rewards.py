@@ -67,8 +67,8 @@ class RewardInput:
     """[N, 64, 3] :func:`xreset.objects.sampling.metric_points` of each world's object, in its frame [m]."""
     is_arm: Tensor
     """[J] bool: the joint is one of the arm's; the others are the hand's."""
-    success_position: Tensor
-    """[] largest distance to the goal that counts as success [m]: the configuration's, or a schedule's."""
+    success_position: float
+    """Largest distance to the goal that counts as success [m] (``task.reward``)."""
     gate: Tensor = field(default_factory=lambda: torch.tensor(True))
     """[N] bool: the condition ``task.reward.gate`` holds. The condition itself does not read it."""
 

@@ -101,7 +101,7 @@ def read_keypoints(
     """Read a tracker's sequences: an npz (one sequence), a CSV (one, or several with a column ``sequence``), or a
     folder of them; see :func:`~xreset.demos.verbs.import_keypoints`.
 
-    The wrist's orientation is that of five keypoints (wrist and knuckles) fitted to an average hand: 3.6 degrees from
+    The wrist's orientation is that of five keypoints (wrist and knuckles) fitted to an average hand: 3.9 degrees from
     MANO's at most, on DexYCB.
     """
     path = Path(path)

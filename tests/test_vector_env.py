@@ -9,6 +9,7 @@ from numpy.testing import assert_array_equal, assert_equal
 from tests.data import refuses
 from tests.test_env import TASK, BreakableBackend, N, WithEnv
 from xreset import VectorEnv, XResetError
+from xreset.env.stable_baselines import StableBaselinesEnv
 from xreset.task.config import ResetConfig, TerminationConfig
 
 
@@ -36,6 +37,11 @@ class VectorEnvTest(WithEnv):
             if step == length + 1:
                 assert_array_equal(reward, 0.0)
                 assert_array_equal(env.env.episode_length_buf, 0)
+
+    def test_what_is_no_environment_is_refused(self):
+        for made in (VectorEnv, StableBaselinesEnv):
+            with refuses(self, "env is 'Lift-v0', expected an environment", XResetError, made):
+                made("Lift-v0")
 
     def test_a_seed_gives_the_same_episodes_whatever_has_succeeded_before(self):
         """The demonstrations that fail most are drawn most often."""

@@ -14,6 +14,7 @@ from xreset.env.vector_env import (
     array,
     arrays,
     checked_action,
+    checked_env,
     observation_space,
     set_seed,
     with_sound_rows,
@@ -43,7 +44,7 @@ class StableBaselinesEnv(VecEnv):
         Raises:
             XResetError: ``env`` is no environment.
         """
-        self.env = env
+        self.env = checked_env(env)
         self.log: dict[str, torch.Tensor] = {}
         self._action = torch.zeros(env.num_envs, env.num_actions, device=env.device)
         spaces = observation_space(env)

@@ -9,6 +9,7 @@ import torch
 
 from xreset.env.manipulation import ManipulationEnv
 from xreset.errors import XResetError, needs
+from xreset.files.text import shown
 from xreset.physics.tensors import where
 
 with needs("gymnasium", "gymnasium"):
@@ -46,7 +47,7 @@ class VectorEnv(gymnasium.vector.VectorEnv):
         Raises:
             XResetError: ``env`` is no environment.
         """
-        self.env = env
+        self.env = checked_env(env)
         self.num_envs = env.num_envs
         env.reset()
         self.single_observation_space = observation_space(env)
@@ -111,6 +112,13 @@ class VectorEnv(gymnasium.vector.VectorEnv):
     def close_extras(self, **_: Any) -> None:
         """Close the engine."""
         self.env.close()
+
+
+def checked_env(env: ManipulationEnv) -> ManipulationEnv:
+    """Return an environment; ``XResetError`` if it is something else."""
+    if not isinstance(env, ManipulationEnv):
+        raise XResetError(f"env is {shown(env)}, expected an environment: xreset.make_env(...).")
+    return env
 
 
 def set_seed(env: ManipulationEnv, seed: int) -> None:

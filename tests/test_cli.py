@@ -287,7 +287,7 @@ class UsageTest(TestCase):
             self.assertLessEqual(max(map(len, text.splitlines())), 80)
         self.assertNotIn("{None}", words)
         self.assertNotIn("--config.task", words)
-        for name in ("task.randomization.push", "ppo", "schedule"):
+        for name in ("task.randomization.push", "ppo", "model"):
             self.assertIn(f" {name} ", parts)
         self.assertRegex(reset, r"--config.task.reset.random-gravity[\s\S]*\(default: True\)")
         self.assertNotIn("--config.task.reward", reset)

@@ -20,7 +20,7 @@ from xreset import VisionConfig, robots
 from xreset.errors import FileFormatError
 from xreset.files.checks import from_dict, merged
 from xreset.learning.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
-from xreset.learning.config import ModelConfig, PpoConfig, ScheduleConfig, TrainConfig
+from xreset.learning.config import ModelConfig, PpoConfig, TrainConfig
 from xreset.learning.distributed import Processes
 from xreset.learning.export import exported
 from xreset.learning.model import PointNetLstmModel, ReturnCritic
@@ -498,7 +498,12 @@ class ConfigTest(TestCase):
             },
             "model": {"activation": "elu", "conv": [16, 32, 32]},
             "ppo": clipping | {"gae_lambda": 0.95, "schedule": "adaptive"},
-            "schedule": {"faults": [], "demo_probability": [], "success_position": []},
+            "schedule": {
+                "faults": [],
+                "demo_probability": [],
+                "success_position": [],
+                "teacher": [],
+            },
             "random_episode_start": True,
             "target_success": None,
         }
@@ -510,24 +515,3 @@ class ConfigTest(TestCase):
             from_dict(TrainConfig, data)
         for value in ("task.reset.frontier is 0.75", "model.synergy_std is 0.4"):
             self.assertIn(f"configuration.{value}. This option was removed;", str(caught.exception))
-
-
-class ChangingSettings(TestCase):
-    def test_a_schedule_that_ends_before_it_begins_is_refused(self):
-        for points in (
-            ((0.5, 0.9), (0.2, 0.1)),
-            ((0.0, 0.9), (0.0, 0.1)),
-            ((0.0, 1.2),),
-            ((-0.1, 0.5),),
-            ((0.0, 0.5), (1.1, 0.5)),
-            ((0.0, math.nan),),
-            ((math.nan, 0.5), (1.0, 0.5)),
-            (0.0, 0.5, 1.0, 0.2),  # as on the command line
-            ((0.0, 0.5), (1.0,)),
-            ((0.0, "a"),),
-            {0.0: 0.5},
-            np.array([[0.0, 0.5]]),
-            0.5,
-        ):
-            with refuses(self, "each share greater than the one before", ValueError, points):
-                ScheduleConfig(teacher=points)

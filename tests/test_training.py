@@ -45,7 +45,7 @@ from xreset.eval.policy_spec import load_policy
 from xreset.files.storage import claim, file_hash, write_json
 from xreset.learning import verbs
 from xreset.learning.checkpoint import load_moments, read_checkpoint
-from xreset.learning.config import ScheduleConfig, TrainConfig
+from xreset.learning.config import TrainConfig
 from xreset.learning.export import exported
 from xreset.learning.exported import read_policy
 from xreset.learning.recipes import RECIPES, own_terms_flags, starting_config
@@ -429,11 +429,11 @@ class TrainingTest(WithBank):
         found = newest(out).resets_state_dict["success_rate"]
         assert_close(found, torch.zeros(3), rtol=0, atol=0.1)
 
-    def test_a_schedule_continues_where_a_stopped_run_was(self):
+    def test_a_run_goes_on_at_the_share_that_was_done(self):
         """Stopped after two of many iterations, then resumed for as much time as it had taken."""
-        out = self.train("scheduled")
+        out = self.train("halfway")
         progress = []
-        with patch.object(TrainingRunner, "_follow_schedule", lambda _, x: progress.append(x)):
+        with patch.object(TrainingRunner, "_let_teacher_lead", lambda _, x: progress.append(x)):
             self.resume(out, iterations=1000, minutes=2 * newest(out).elapsed / 60)
         self.assertGreater(progress[0], 0.5 - 1e-9)
         self.assertEqual(progress, sorted(progress))
@@ -700,7 +700,6 @@ class TrainingTest(WithBank):
         observation = replace(CONFIG.task.observation, perception=cloud)
         short = replace(CONFIG, task=replace(CONFIG.task, observation=observation))
         wide = replace(CONFIG, model=replace(CONFIG.model, lstm=16))
-        idle = replace(CONFIG, schedule=ScheduleConfig(teacher=((0.0, 1.0),)))
         empty = toy_bank(self.robot).with_states(np.zeros(6, dtype=bool))
         for words, options in (
             ("is not a run folder", {"weights": self.folder, "goals": toy_goals(self.robot)}),
@@ -716,7 +715,6 @@ class TrainingTest(WithBank):
             ("onnx holds no critic.*Give the folder", {"weights": self.out / "policy.onnx"}),
             ("000002.pt is a file. Give the folder", {"weights": latest_checkpoint(self.out)}),
             (f"folder above has one: give {self.out}", {"weights": self.out / "checkpoints"}),
-            ("this training has no teacher", {"config": idle}),
             ("Both recipe and config", {"recipe": "live"}),
             ("'mujoco' does not run on 'cuda'|can use 0 GPUs", {"device": "cuda"}),
             ("needs a reset bank .--resets., a goal set .--goals., or both", {"bank": None}),

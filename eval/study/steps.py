@@ -353,4 +353,4 @@ def flags(values: dict[str, Any]) -> Iterator[str]:
             yield flag if value else f"--{group}{dot}no-{last}"
         elif value is not None:
             yield flag
-            yield from map(str, np.array(value, dtype=object).ravel())  # a schedule holds pairs
+            yield from map(str, np.array(value, dtype=object).ravel())

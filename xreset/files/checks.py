@@ -400,7 +400,7 @@ def _parsed_record(cls: type, data: Any, where: str, problems: list[str]) -> Any
         kept = removed[name] if isinstance(removed[name], tuple) else (removed[name],)
         if data[name] not in kept:
             problems.append(
-                f"{where}.{name} is {shown(data[name])}. This option was removed; only {removed[name]!r} can be read. "
+                f"{where}.{name} is {shown(data[name])}. This option was removed; only {kept[0]!r} can be read. "
                 "Use an earlier version of xreset."
             )
     data = {name: value for name, value in data.items() if name not in removed}

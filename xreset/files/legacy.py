@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import product
 from typing import Any
 
 REMOVED: dict[str, dict[str, Any]] = {
@@ -39,8 +40,21 @@ REMOVED: dict[str, dict[str, Any]] = {
         "clip": 0.2,
         "schedule": "adaptive",
     },
-    "ScheduleConfig": {"demo_probability": [], "success_position": [], "faults": []},
-    "TrainConfig": {"random_episode_start": True, "target_success": None},
+    "TrainConfig": {
+        "random_episode_start": True,
+        "target_success": None,
+        "schedule": tuple(
+            entries | {"teacher": teacher}
+            for entries, teacher in product(
+                (
+                    {},
+                    {"success_position": [], "faults": []},
+                    {"success_position": [], "faults": [], "demo_probability": []},
+                ),
+                ([], [[0.0, 1.0], [0.2, 0.0]]),
+            )
+        ),
+    },
     "Data": {"goals": None, "synthetic_seed": 0},
     "Evaluation": {"unseen": False},
     "EvalResult": {"measured": {}},

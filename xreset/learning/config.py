@@ -4,10 +4,7 @@ open. Those of a training are the recipe of the headline results."""
 from __future__ import annotations
 
 from dataclasses import asdict
-from itertools import pairwise
 from typing import Annotated, Any, Literal
-
-import numpy as np
 
 from xreset.errors import WrongValueError
 from xreset.files.checks import (
@@ -97,52 +94,6 @@ class PpoConfig(Checked):
         return max(1, min(num_worlds * self.horizon // self.minibatch_size, num_worlds // 2))
 
 
-Points = tuple[tuple[float, float], ...]
-"""Pairs of a share of the run, from 0 to 1, and the value there; straight lines between them. Empty: no schedule."""
-
-
-def is_schedule(points: Points) -> bool:
-    """Whether the shares rise from 0 or more to 1 or less, and all values lie between 0 and 1.
-
-    Raises:
-        TypeError, ValueError: these are not pairs of numbers.
-    """
-    if not isinstance(points, tuple | list):
-        return False
-    shares = [share for share, _ in points]
-    rising = all(earlier < later for earlier, later in pairwise(shares))
-    return rising and all(0 <= share <= 1 and 0 <= value <= 1 for share, value in points)
-
-
-ShareSchedule = Annotated[
-    Points,
-    Rule(
-        "pairs of a share of the run and a value, all from 0 to 1, each share greater than the one before",
-        is_schedule,
-    ),
-]
-
-
-@frozen
-class ScheduleConfig(Checked):
-    """Settings that change during a run.
-
-    A schedule is a list of points: a share of the run and the setting's value there, such as ``0 0.9 1 0.25``. Values
-    between two points lie on a straight line. The share of the run is that of its iterations or that of its minutes,
-    whichever is larger; a limit that the run does not have counts as 0. A run that is resumed continues where it
-    stopped, not at share 0.
-    """
-
-    teacher: ShareSchedule = ()
-    """Share of the worlds in which the teacher acts during a distillation. Empty: none."""
-
-
-def value_at(points: Points, progress: float) -> float:
-    """Return the value of a schedule at a share of the run."""
-    shares, values = zip(*points, strict=True)
-    return float(np.interp(progress, shares, values))
-
-
 # The recipe of the headline results (docs/results.md) --------------------------------------------------------------
 
 MODEL = ModelConfig(lstm=256, initial_std=0.3)
@@ -173,7 +124,6 @@ class TrainConfig(Checked):
     task: TaskConfig = TASK
     model: ModelConfig = MODEL
     ppo: PpoConfig = PPO
-    schedule: ScheduleConfig = ScheduleConfig()
     iterations: PositiveInt = 2600
     """Number of iterations of a training that is given neither iterations nor minutes; 2,600 with 4,096 worlds are 170
     M steps, or 25 minutes of one H100."""

@@ -23,6 +23,10 @@ from xreset.learning.model import make_actor
 from xreset.learning.ppo import GRAD_NORM, first_steps, piece_states
 from xreset.policy.onnx_policy import OnnxPolicy
 
+LED = 0.2
+"""Share of a training in which the teacher acts as well: in all worlds at the begin, in ever fewer, in none at this
+share."""
+
 
 class SequenceDistillation(Distillation):
     """rsl-rl's distillation with an update on sequences.

@@ -12,6 +12,7 @@ from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from tensordict import TensorDict
 from torch import Tensor
@@ -26,8 +27,8 @@ from xreset.learning.checkpoint import (
     read_checkpoint,
     write_checkpoint,
 )
-from xreset.learning.config import TrainConfig, value_at
-from xreset.learning.distillation import SequenceDistillation
+from xreset.learning.config import TrainConfig
+from xreset.learning.distillation import LED, SequenceDistillation
 from xreset.learning.distributed import Processes
 from xreset.learning.log import TrainingLog
 from xreset.learning.ppo import SequencePpo
@@ -139,7 +140,7 @@ class TrainingRunner:
             _stop_on_interrupt(say=self.processes.is_main) as requests,
         ):
             while not self._agreed(bool(requests) or self._progress(total, minutes) >= 1):
-                self._follow_schedule(self._progress(total, minutes))
+                self._let_teacher_lead(self._progress(total, minutes))
                 obs = self._iterate(obs, log)
                 if self.iteration % self.config.save_interval == 0:
                     self.save_checkpoint()
@@ -168,11 +169,10 @@ class TrainingRunner:
         """Whether any process is to stop: then all do, after the same iteration."""
         return bool(self.processes.sum(torch.tensor(int(stop), device=self.device)))
 
-    def _follow_schedule(self, progress: float) -> None:
-        """Give the settings that have a schedule their values at a share of the run."""
-        schedule = self.config.schedule
-        if schedule.teacher and isinstance(self.alg, SequenceDistillation):
-            self.alg.teacher_share = value_at(schedule.teacher, progress)
+    def _let_teacher_lead(self, progress: float) -> None:
+        """Let the teacher of a student act in as many worlds as at a share of the run (:data:`LED`)."""
+        if isinstance(self.alg, SequenceDistillation):
+            self.alg.teacher_share = float(np.interp(progress, (0.0, LED), (1.0, 0.0)))
 
     def _iterate(self, obs: TensorDict, log: TrainingLog | None) -> TensorDict:
         """Collect a rollout, learn from it and write the log; return the last observations."""

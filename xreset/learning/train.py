@@ -227,19 +227,14 @@ def bank_or_goals(
 
 
 def check_config(config: TrainConfig, inputs: Inputs, *, has_teacher: bool) -> None:
-    """Refuse, with ``XResetError``, a schedule without effect, bank states where there are none, unknown terms of the
-    reward, and a student without cameras."""
+    """Refuse, with ``XResetError``, bank states where there are none, unknown terms of the reward, and a student
+    without cameras."""
     if has_teacher and not config.task.vision.cameras:
         raise XResetError(
             "A student needs a camera. Give one or two of: " + ", ".join(CAMERAS) + "."
         )
     check_each_once(config.task.vision.cameras)
     RewardFunction(config.task.reward)
-    if config.schedule.teacher and not has_teacher:
-        raise RunError(
-            "schedule.teacher is for students (--teacher), and this training has no teacher. Leave it empty: "
-            "--config.schedule.teacher without a value"
-        )
     if config.task.reset.demo_probability > 0 and not inputs.bank.num_states:
         raise RunError(
             f"There is no state to reset to in {inputs.name}: every candidate was rejected. Look at its reasons "

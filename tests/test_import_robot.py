@@ -372,6 +372,8 @@ class Toy(Robots):
         mimic = self.read("chain.urdf", chain)[0].joint("f2_2").mimic
         self.assertEqual((mimic.source, mimic.multiplier), ("f1_1", 0.4))
         self.assertAlmostEqual(mimic.offset, 0.15)
+        still = self.read("still.urdf", chain.replace('multiplier="0.5"', 'multiplier="0"'))[0]
+        self.assertEqual(still.joint("f2_2").type, "fixed")
         with self.assertRaisesRegex(RobotError, "follow one another in a circle: f1_2. Let"):
             self.read("circle.urdf", HAND.replace('<mimic joint="f1_1"', '<mimic joint="f1_2"'))
 

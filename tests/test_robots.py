@@ -202,6 +202,7 @@ class Registry(Copied):
                 "home = 0.38, kp = 400.0": 'home = "0.38", kp = true',
                 'keypoint = "index4"': 'keypoint = "index5"',
                 "pos = [0.45, 0.60, 0.55]": "pos = [0.45, 0.60]",
+                'source = "finger_joint1" }': 'source = "finger_joint1", multiplier = 0.0 }',
             },
         )
         self.refused(
@@ -210,7 +211,8 @@ class Registry(Copied):
             "joints[0].kp",
             "index5",
             "base.pos has 2",
-            "5 places",
+            "mimics[0].multiplier is 0.0, expected a number other than 0",
+            "6 places",
         )
 
     def test_contradictions(self):

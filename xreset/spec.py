@@ -103,7 +103,7 @@ class MimicSpec:
     """URDF joint that follows."""
     source: Text
     """The actuated joint."""
-    multiplier: Number = 1.0
+    multiplier: Annotated[Number, Rule("a number other than 0", bool)] = 1.0
     offset: Number = 0.0
     """[rad or m]"""
 

@@ -358,6 +358,10 @@ def _with_sources(tree: RobotTree, path: str | Path, notes: list[str]) -> RobotT
                 f"{path}: {name!r} mimics {mimic.source!r}, which is not a moving joint of the same file. Make "
                 f"{name!r} fixed, or let it follow another joint."
             )
+        if not mimic.multiplier:
+            notes.append(f"{name!r} is fixed, because its multiplier is 0")
+            joints.append(replace(_at(joint, mimic.offset), type="fixed", mimic=None))
+            continue
         driver = moving[mimic.source]
         ends = mimic.multiplier * np.array((driver.lower, driver.upper)) + mimic.offset
         low, high = sorted(ends.tolist())

@@ -736,6 +736,7 @@ class Toy(Robots):
             self.assertEqual(len(spec.arm_indices), 7)
             # a target 2 cm inside of an object must press, although no stiffness is stated
             self.assertGreater(spec.joints[-1].drive.kp * 0.02, 10.0)
+            self.assertEqual(spec.home_std[1], 0.005)
             tree = load_urdf(spec.urdf)
             for link in ("left_finger", "right_finger"):  # with rotors of 0.1 kg
                 before = load_urdf(described.urdf).link(link).mass

@@ -23,7 +23,7 @@ from xreset.geometry.description import load_robot
 from xreset.geometry.dynamics import drive_inertia
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.shapes import roll_pitch_yaw, surface_of
-from xreset.geometry.urdf import Joint, RobotTree
+from xreset.geometry.urdf import Joint, RobotTree, prismatic_joints
 from xreset.geometry.urdf_writer import axes, pose
 from xreset.physics.plugins import DESCRIPTION, robot_names
 from xreset.robot_tools.check import MOST_TOUCHING, Finding, check, touching_itself
@@ -63,6 +63,8 @@ _EFFORTS = {
 """[N m or N] Effort limits that are believed."""
 _SLIDE = {"hand": 0.02, "arm": 0.05}
 """[m] Way of a sliding joint's target beyond the joint that asks for its whole effort."""
+_SLIDE_SPREAD = 0.005
+"""[m] Spread of a hand that only slides around home, as in the built-in gripper."""
 _STABLE = {"hand": 0.8, "arm": 0.3}
 """Share of the largest kp that is stable in engines that integrate drives explicitly: kd times the step stays below the
 inertia. With stiffer arms, MuJoCo's steps differ from finer ones by more than its check allows."""
@@ -393,6 +395,8 @@ def _with_arm_home(spec: RobotSpec, T_hand_palm: np.ndarray, notes: list[str]) -
 def _with_free_spread(spec: RobotSpec, notes: list[str]) -> RobotSpec:
     """Return the robot with its hand's spread around home halved, once or twice, until its fingers rarely touch."""
     arm, hand = spec.home_std
+    if prismatic_joints(spec)[spec.hand_indices].all():
+        hand = _SLIDE_SPREAD
     for smaller in (hand, hand / 2, hand / 4):
         spec = replace(spec, home_std=(arm, smaller))
         if touching_itself(spec) <= MOST_TOUCHING:

@@ -114,7 +114,7 @@ class Played(InFolder):
         session.begin(keep_goal=True)
         assert_allclose(session.step().goal_pos, goal, atol=1e-6)
         self.assertFalse(session.away or session.lost)
-        self.assertLess(self.steps(4.0).distance, 0.05)
+        self.assertLess(self.steps(4.0).distance, 0.1)  # 0.36 m in the beginning
 
     def test_what_falls_off_the_table_is_caught(self):
         session = self.session

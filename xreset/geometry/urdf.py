@@ -588,9 +588,8 @@ def _mesh_hull(mesh: yourdfpy.Mesh, link: str, path: Path) -> Geometry:
         )
     try:
         solid = load_mesh(file)
-        if (
-            file.suffix.lower() == ".dae" and solid.units
-        ):  # Collada states its unit, as ROS reads it
+        # Collada states its unit, and ROS reads it
+        if file.suffix.lower() == ".dae" and solid.units:
             solid.convert_units("meters")
         vertices = np.asarray(solid.vertices)
         if not (np.abs(vertices) < _LARGEST).all():

@@ -24,8 +24,7 @@ from xreset.learning.ppo import GRAD_NORM, first_steps, piece_states
 from xreset.policy.onnx_policy import OnnxPolicy
 
 LED = 0.2
-"""Share of a training in which the teacher acts as well: in all worlds at the begin, in ever fewer, in none at this
-share."""
+"""Share of a training in which the teacher acts as well: in all worlds at the beginning, then in fewer and fewer."""
 
 
 class SequenceDistillation(Distillation):

@@ -170,6 +170,22 @@ class SettingOneWorldBrakesTheOthers(MujocoWorld):
             other._data.qvel[:] *= 0.9
 
 
+@breaks("selected_worlds")
+class LinksThatStayWhereSomeWorldsAreSet(MujocoBackend):
+    def set_state(self, state, worlds=None):
+        before = self._links.clone()
+        super().set_state(state, worlds)
+        if worlds is not None:
+            self._links.map(torch.Tensor.copy_, before)
+
+
+@breaks("resting_weight")
+class SettingOneWorldClearsTheContactsOfAll(MujocoBackend):
+    def set_state(self, state, worlds=None):
+        super().set_state(state, worlds)
+        self._contacts.table_force.zero_()
+
+
 @breaks("masked_set")
 class MaskedValuesInTheOrderOfTheMask(MujocoBackend):
     def set_where(self, mask, state, parameters):
@@ -236,6 +252,12 @@ def stiffness_scaled(model, at):
 @remodelled("drive_equation", "effort_limit")
 def drive_without_effort_limit(model, at):
     model.actuator_forcelimited[:] = 0
+
+
+@breaks("drive_equation")
+class OneStepInPlaceOfAControlStep(MujocoBackend):
+    def step(self, substeps=None):
+        super().step(substeps or 1)
 
 
 @breaks("drive_equation")
@@ -342,6 +364,13 @@ class WrenchAtTheOriginOfTheMeshFrame(MujocoWorld):
         body = self._at.object_body
         arm = self._data.xpos[body] - self._data.xipos[body]
         super().set_object_wrench(force, torque + np.cross(arm, force))
+
+
+@breaks("object_wrench")
+class WrenchInTheObjectsFrame(MujocoWorld):
+    def set_object_wrench(self, force, torque):
+        quat = self.get_state()["object_quat"]
+        super().set_object_wrench(rotate(quat, force), rotate(quat, torque))
 
 
 @breaks("object_gravity", "set_as_built", "sliding_distance", "slope", "tip_friction")

@@ -25,7 +25,8 @@ Motion = Callable[[Bench, Worlds, Sequence[int]], tuple[State, Tensor]]
 
 
 def resting_weight(bench: Bench) -> Measured:
-    """Put objects on the table: no force right after setting; after half a second the table carries their weight."""
+    """Put objects on the table: no force right after setting; after half a second the table carries their weight, and
+    goes on to in the worlds that are not set then."""
     worlds = bench.worlds()
     start = bench.start()
     fresh = worlds.contacts()
@@ -33,11 +34,15 @@ def resting_weight(bench: Bench) -> Measured:
     contacts = worlds.contacts()
     moved = worlds.state().object_pos - start.object_pos
     weight = GRAVITY * bench.masses
+    worlds.set(start, [3, 1])
+    left = contacts.table_force.clone()
+    left[[3, 1]] = 0.0
     return bench.by_object(
         {
             "force right after setting": torch.cat(
                 (fresh.table_force[:, None], fresh.tip_force), dim=1
             ),
+            "force after some were set": worlds.contacts().table_force - left,
             "vertical force": contacts.table_force[:, 2] / weight - 1.0,
             "horizontal force": contacts.table_force[:, :2] / weight[:, None],
             "force of the fingers": contacts.tip_force,

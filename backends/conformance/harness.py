@@ -94,8 +94,9 @@ class Worlds:
         self.backend.set_where(mask, state.to(device), Parameters(**values))
 
     def step(self, steps: int) -> None:
-        """Advance by some physics steps of the scene."""
-        self.backend.step(steps * self._finer)
+        """Advance by some physics steps of the scene; one control step is the default of an engine."""
+        count = steps * self._finer
+        self.backend.step(None if count == self.backend.scene.substeps else count)
 
     def advance(self, start: State, steps: int) -> State:
         """Return what becomes of a state [N, ...] in some physics steps of the scene."""

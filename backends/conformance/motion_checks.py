@@ -17,6 +17,7 @@ from xreset.physics import State
 from xreset.spec import GRAVITY, ObjectSpec
 
 _STEPS = 24
+_TILTED = torch.tensor([0.5, 0.5, 0.5, 0.5])  # the object's x along the world's y, y along z
 
 
 def free_fall(bench: Bench) -> Measured:
@@ -126,24 +127,27 @@ def object_gravity(bench: Bench) -> Measured:
 
 
 def object_wrench(bench: Bench) -> Measured:
-    """Push and twist objects in the air, with other masses if those can be set; setting a state ends the wrench."""
+    """Push and twist tilted objects in the air, with other masses if those can be set; setting a state ends the
+    wrench."""
     worlds = bench.worlds()
     factor = torch.ones(bench.NUM_WORLDS)
     if "object_mass" in worlds.backend.capabilities:
         factor = torch.tensor([1.5, 1.0, 0.5, 2.0])
         worlds.set_parameter("object_mass", factor * bench.masses)
-    worlds.set(bench.in_the_air())
+    start = replace_fields(bench.in_the_air(), object_quat=_TILTED)
+    worlds.set(start)
     force = torch.tensor([1.2, -0.8, 0.5])
     twist = torch.tensor([2e-3, -1e-3, 1.5e-3])
     worlds.push(force, twist)
     steps = 8
     worlds.step(steps)
     state = worlds.state()
-    after = worlds.advance(bench.in_the_air(), steps)
+    after = worlds.advance(start, steps)
     t = steps * bench.scene.timestep
     com = torch.tensor(np.stack([obj.com for obj in bench.objects])).float()
     inertia = torch.tensor(np.stack([obj.inertia for obj in bench.objects])).float()
-    inertia = factor[:, None, None] * inertia
+    R = quat_to_matrix(start.object_quat)
+    inertia = factor[:, None, None] * (R @ inertia @ R.mT)
     gained = force / (factor * bench.masses)[:, None] * t - torch.tensor([0.0, 0.0, GRAVITY * t])
     omega = torch.linalg.solve(inertia, twist.expand_as(com)) * t  # the object has hardly turned
     arm = quat_rotate(state.object_quat, com)

@@ -49,18 +49,22 @@ def selected_worlds(bench: Bench) -> Measured:
     chosen = [3, 1]
     rest = [0, 2]
 
-    def run(interfere: bool) -> tuple[State, State]:
+    def run(interfere: bool) -> tuple[State, Tensor, State]:
         worlds = bench.worlds()
         worlds.advance(start, 4)
         if interfere:
             worlds.set(new, chosen)
         right_after = worlds.state()
+        links = worlds.links().pos
         worlds.step(4)
-        return right_after, worlds.state()
+        return right_after, links, worlds.state()
 
-    at_set, after = run(interfere=True)
-    untouched_at_set, untouched = run(interfere=False)
+    at_set, links, after = run(interfere=True)
+    untouched_at_set, expected_links, untouched = run(interfere=False)
+    poses = bench.kinematics.link_poses(new.joint_pos.double(), bench.scene.robot.tracked_links)
+    expected_links[chosen] = poses[chosen, :, :3, 3].float()
     return {
+        "links": links - expected_links,
         **state_errors(at_set[chosen], new[chosen], "set"),
         **state_errors(at_set[rest], untouched_at_set[rest], "others' at once"),
         **state_errors(after[rest], untouched[rest], "others' later"),

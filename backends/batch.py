@@ -142,7 +142,7 @@ class BatchBackend(Backend):
 
     def set_where(self, mask: Tensor, state: State, parameters: Parameters) -> None:
         self._must_be_open()
-        self.chosen.copy_(mask)
+        self.chosen.copy_(self._checked_mask(mask))
         for name, value in parameters.given().items():
             self._require(name)
             present = self.parameters[name]
@@ -156,7 +156,8 @@ class BatchBackend(Backend):
         self._must_be_open()
         index = self._choose(worlds)
         present = self.parameters[name]
-        present[index] = self._checked(name, value, (len(index), *present.shape[1:]))
+        shape = (len(index), *present.shape[1:])
+        present[index] = self._checked_parameter(name, value, shape)
         self.apply_parameters()
 
     def _mask_for(self, tensor: Tensor) -> Tensor:

@@ -270,7 +270,8 @@ class PoolBackend(Backend):
         self._require(name)
         index = self._selected(worlds)
         present = self._arrays[name]
-        present[index] = self._checked(name, value, (len(index), *present.shape[1:])).numpy()
+        shape = (len(index), *present.shape[1:])
+        present[index] = self._checked_parameter(name, value, shape).numpy()
         self._command("set_parameter", index, name)
 
     def _views(self, bundle: type[_Bundle], prefix: str = "") -> _Bundle:
@@ -283,12 +284,7 @@ class PoolBackend(Backend):
     def _selected(self, worlds: Tensor | None) -> np.ndarray:
         if worlds is None:
             return np.arange(self.num_worlds)
-        index = self._indices(worlds).numpy()
-        if index.size and (index.min() < 0 or index.max() >= self.num_worlds):
-            raise WrongValueError(
-                f"worlds must be a list of indices in 0..{self.num_worlds - 1}, found {worlds}"
-            )
-        return index
+        return self._indices(worlds).numpy()
 
     def _command(self, method: str, worlds: np.ndarray | None = None, argument: Any = None) -> None:
         """Run a command in the workers."""

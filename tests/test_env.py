@@ -204,6 +204,7 @@ class RefusalTest(WithEnv):
             (lambda: env.step(still[:1]), r"expected \(3, 7\)"),
             (lambda: env.step(still[:, :1]), r"expected \(3, 7\)"),
             (lambda: env.step(np.zeros((3, 7))), "a ndarray, expected a tensor"),
+            (lambda: env.step(still, [True] * N), "^begin is a list, expected a tensor"),
             (lambda: env.step(still, torch.tensor([0])), r"^begin has the shape \(1,\), expected \(3,\)"),
             (lambda: env.advance(still, torch.zeros(7)), r"^push has the shape \(7,\), expected \(3, 7\)"),
             (lambda: env.reset(torch.tensor([N])), "^worlds is .*, expected indices from 0 to 2"),
@@ -279,6 +280,9 @@ class StepTest(WithEnv):
         self.assert_same(after, before, [0, 2])
         self.assertFalse(torch.equal(after["policy"][1], before["policy"][1]))
         self.assertEqual(env.episode_length_buf.tolist(), [3, 0, 3])
+        start = env._new_start[[1]].clone()
+        env.reset([2], start=start)
+        assert_close(env.goal_pos[2], start.goal_pos[0])
 
     def test_the_same_seed_gives_the_same_episodes(self):
         runs = [self.make(seed=seed) for seed in (3, 3, 4)]

@@ -26,7 +26,7 @@ from xreset.backends.rigid import OTHER_LINK, TABLE
 from xreset.backends.workers import STATE_FIELDS, arrays_in, layout_of
 from xreset.errors import CapabilityError, RobotError, WrongValueError, XResetError
 from xreset.geometry.kinematics import Kinematics
-from xreset.physics import State
+from xreset.physics import Parameters, State
 from xreset.spec import PairFriction
 
 REPOSITORY = Path(__file__).resolve().parents[1]
@@ -231,17 +231,31 @@ class PoolTest(TestCase):
             self.assertRaisesRegex(ValueError, "substeps is 0, expected", pool.step, 0)
             with self.assertRaisesRegex(ValueError, "joint_pos has shape"):
                 pool.set_state(random_state(4, 0))
-            with self.assertRaisesRegex(ValueError, "indices in 0..4"):
-                pool.set_state(random_state(1, 0), tensor([5]))
+            self.assertRaisesRegex(ValueError, "substeps is 2.5, expected", pool.step, 2.5)
             mask = tensor([True, False, False, True, True])
-            with self.assertRaisesRegex(
-                ValueError, r"type torch.bool and shape \(5,\), expected \[M\] indices"
-            ):
-                pool.set_state(random_state(5, 0), mask)
-            with self.assertRaisesRegex(ValueError, "worlds has type torch.float32"):
-                pool.set_object_mass(torch.ones(2), tensor([0.0, 1.0]))
+            for worlds in (tensor([5]), tensor([-1]), tensor([0.5]), tensor([[0]]), mask):
+                words = r"worlds is tensor.*, expected \[M\] indices from 0 to 4"
+                with self.assertRaisesRegex(ValueError, words):
+                    pool.set_state(random_state(len(worlds), 0), worlds)
+            parameters = Parameters(object_mass=torch.ones(5))
+            for not_mask in (tensor([0, 1]), mask[:4], mask.long()):
+                with self.assertRaisesRegex(ValueError, r"mask is .*, expected \[5\] bool"):
+                    pool.set_where(not_mask, random_state(5, 0), parameters)
+            before = pool._wrench.clone()
+            for name, *wrench in (("force", 4, 2), ("torque", 3, 2)):
+                with self.assertRaisesRegex(ValueError, rf"{name} has shape .*expected \(5, 3\)"):
+                    pool.set_object_wrench(*(torch.ones(5, width) for width in wrench))
+            assert_close(pool._wrench, before)
+            for value in (0.0, -1.0, float("nan")):
+                with self.assertRaisesRegex(ValueError, "object_mass is .*, expected .* above 0"):
+                    pool.set_object_mass(torch.full((5,), value))
+            with self.assertRaisesRegex(ValueError, "friction is .*, expected .* at least 0"):
+                pool.set_friction(-torch.ones(5, 3))
             with self.assertRaisesRegex(CapabilityError, "'toy' does not support object gravity"):
                 pool.set_object_gravity(torch.ones(5))
+        for index in (tensor([0.7]), tensor([2]), tensor([0, 0])):
+            with self.assertRaisesRegex(ValueError, r"object_index is .*, expected \[1\] indices"):
+                ToyBackend(toy_scene(), 1, object_index=index, workers=0)
         with self.assertRaisesRegex(CapabilityError, "CPU only"):
             ToyBackend(toy_scene(), 1, device="cuda")
 

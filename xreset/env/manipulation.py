@@ -48,6 +48,10 @@ if TYPE_CHECKING:
 
 
 def _check_shape(name: str, value: Tensor, expected: tuple[int, ...]) -> None:
+    if not isinstance(value, Tensor):
+        raise XResetError(
+            f"{name} is a {type(value).__name__}, expected a tensor: torch.as_tensor({name})."
+        )
     if value.shape != expected:
         raise XResetError(f"{name} has the shape {tuple(value.shape)}, expected {expected}.")
 
@@ -354,17 +358,18 @@ class ManipulationEnv:
         """
         if worlds is None:
             worlds = torch.arange(self.num_envs, device=self.device)
+        index = torch.as_tensor(worlds, device=self.device)
         self._reset_mask.zero_()
         try:
-            if (torch.as_tensor(worlds) < 0).any():
+            if (index < 0).any():
                 raise IndexError("torch counts negative indices from the end")
-            self._reset_mask[worlds] = True
+            self._reset_mask[index] = True
         except IndexError as error:
             raise XResetError(
                 f"worlds is {shown(worlds)}, expected indices from 0 to {self.num_envs - 1}."
             ) from error
         if start is not None:
-            self._new_start[worlds] = start
+            self._new_start[index] = start
         before = self.worlds.clone()
         self._sample_resets(start is None)
         if seeds is not None:
@@ -424,10 +429,6 @@ class ManipulationEnv:
 
     def _apply_action(self, action: Tensor, push: Tensor | None = None) -> None:
         """Step the physics with an action; arguments as for :meth:`advance`."""
-        if not isinstance(action, Tensor):
-            raise XResetError(
-                f"The actions are a {type(action).__name__}, expected a tensor: torch.as_tensor(actions)."
-            )
         _check_shape("action", action, (self.num_envs, self.num_actions))
         if self.slots is not None:
             action = action[:, self.slots.of_joint]

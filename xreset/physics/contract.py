@@ -29,6 +29,8 @@ Parameter = Literal[
     "drives",
 ]
 """A physical parameter with a value per world, set by ``Backend.set_...``."""
+_POSITIVE = ("object_mass", "object_inertia")
+_NOT_NEGATIVE = ("friction", "torsional_friction", "drives")
 Capability = Literal[Parameter, "object_wrench", "overflow", "mass_properties"]
 """A feature that some backends lack: set a parameter per world, apply a wrench, count overflows, read back masses,
 centers of mass and inertias."""
@@ -296,10 +298,13 @@ class Backend(ABC):
         self.device = torch.device(device)
         if object_index is None:
             object_index = torch.arange(num_worlds) % count
-        self.object_index = torch.as_tensor(object_index, dtype=torch.long).to(self.device)
-        valid = (self.object_index >= 0) & (self.object_index < count)
-        if self.object_index.shape != (num_worlds,) or not valid.all():
-            raise WrongValueError(f"object_index must be [{num_worlds}] indices below {count}")
+        index = torch.as_tensor(object_index)
+        is_valid = index.shape == (num_worlds,) and not index.is_floating_point()
+        if not is_valid or not ((index >= 0) & (index < count)).all():
+            raise WrongValueError(
+                f"object_index is {shown(index)}, expected [{num_worlds}] indices below {count}"
+            )
+        self.object_index = index.long().to(self.device)
 
     # Availability ----------------------------------------------------------------------------------------------------
 
@@ -412,12 +417,11 @@ class Backend(ABC):
 
         It stays until it is replaced, or the world's state is set.
         """
-        import torch
-
         self._require("object_wrench")
         self._must_be_open()
-        wrench = torch.cat((torch.as_tensor(force), torch.as_tensor(torque)), dim=-1)
-        self._wrench.copy_(self._checked("wrench", wrench, self._wrench.shape))
+        force = self._checked("force", force, (self.num_worlds, 3))
+        self._wrench[:, 3:] = self._checked("torque", torque, force.shape)
+        self._wrench[:, :3] = force
 
     # Many worlds at once ---------------------------------------------------------------------------------------------
 
@@ -432,7 +436,7 @@ class Backend(ABC):
             state: [N, ...]
             parameters: [N, ...]
         """
-        worlds = mask.nonzero().squeeze(-1)
+        worlds = self._checked_mask(mask).nonzero().squeeze(-1)
         if not len(worlds):
             return
         for name, value in parameters.given().items():
@@ -468,19 +472,30 @@ class Backend(ABC):
             raise XResetError(f"The engine {self.name!r} is closed. Build a new one.")
 
     def _indices(self, worlds: Tensor) -> Tensor:
-        """Return indices of worlds [M] on the backend's device; ``WrongValueError`` for a mask, or numbers of another
-        type or shape. Their range is not checked: a GPU would have to be waited for."""
+        """Return indices of worlds [M] on the backend's device; ``WrongValueError`` for anything else. On a GPU, which
+        would have to be waited for, their range is not checked."""
         import torch
 
         index = torch.as_tensor(worlds, device=self.device)
-        if index.ndim != 1 or (
-            len(index) and (index.dtype == torch.bool or index.is_floating_point())
-        ):
+        is_whole = index.dtype != torch.bool and not index.is_floating_point()
+        is_valid = index.ndim == 1 and (is_whole or not len(index))
+        if is_valid and self.device.type == "cpu":
+            is_valid = bool(((index >= 0) & (index < self.num_worlds)).all())
+        if not is_valid:
             raise WrongValueError(
-                f"worlds has type {index.dtype} and shape {tuple(index.shape)}, expected [M] indices. "
+                f"worlds is {shown(worlds)}, expected [M] indices from 0 to {self.num_worlds - 1}. "
                 "For a mask, call set_where, or give mask.nonzero().squeeze(-1)."
             )
         return index.long()
+
+    def _checked_mask(self, mask: Tensor) -> Tensor:
+        """Return a mask of worlds; ``WrongValueError`` for anything else."""
+        import torch
+
+        mask = torch.as_tensor(mask)
+        if mask.shape != (self.num_worlds,) or mask.dtype != torch.bool:
+            raise WrongValueError(f"mask is {shown(mask)}, expected [{self.num_worlds}] bool")
+        return mask
 
     def _checked_state(self, state: State, rows: int) -> State:
         """Return a state on the backend's device; ``WrongValueError`` if it has another number of rows."""
@@ -498,12 +513,23 @@ class Backend(ABC):
             raise WrongValueError(f"{name} has shape {tuple(value.shape)}, expected {tuple(shape)}")
         return value.contiguous()
 
+    def _checked_parameter(self, name: Parameter, value: Tensor, shape: tuple[int, ...]) -> Tensor:
+        """Return values of a physical parameter on the backend's device; ``WrongValueError`` if they have another shape
+        or, on a CPU, if they are too small: Bullet would fix an object without mass in space."""
+        value = self._checked(name, value, shape)
+        if self.device.type == "cpu":
+            if name in _POSITIVE and not (value > 0).all():
+                raise WrongValueError(f"{name} is {shown(value)}, expected numbers above 0")
+            if name in _NOT_NEGATIVE and not (value >= 0).all():
+                raise WrongValueError(f"{name} is {shown(value)}, expected numbers of at least 0")
+        return value
+
     def _checked_substeps(self, substeps: int | None) -> int:
         """Return the number of physics steps to take; default: those of one control step."""
         if substeps is None:
             return self.scene.substeps
-        if substeps < 1:
-            raise WrongValueError(f"substeps is {substeps}, expected at least 1")
+        if substeps < 1 or substeps % 1:
+            raise WrongValueError(f"substeps is {substeps}, expected a whole number of at least 1")
         return substeps
 
     def _require(self, capability: Capability) -> None:

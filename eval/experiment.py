@@ -60,7 +60,7 @@ def play(
     found.folder = folder
     with claim_folder(folder):
         for engine in engines:
-            _warn_of_replaced(folder / f"{engine.name}.json", trial)
+            _warn_of_replaced(folder / f"{engine.name}.json", policy, trial)
         for engine in engines:
             result, traces = _play_in(
                 engine,
@@ -169,15 +169,18 @@ def _length(trial: Trial) -> float:
     return float(trial.task.termination.episode_seconds)  # JSON has no numbers of NumPy
 
 
-def _warn_of_replaced(file: Path, trial: Trial) -> None:
-    """Warn, before any episode, of results that will be replaced although they are of other demonstrations or of
-    episodes of another length."""
+def _warn_of_replaced(file: Path, policy: PolicySpec, trial: Trial) -> None:
+    """Warn, before any episode, of results that will be replaced although they are of another policy, of other
+    demonstrations or of episodes of another length. A policy that was trained on has the same name."""
     try:
         known = read_result(file)
     except XResetError:  # the file does not exist, or is damaged
         return
     what = ""
-    if known.inputs.get("demos") != trial.inputs.get("demos"):
+    is_same_file = policy.hash is not None and known.inputs.get("policy") == policy.hash
+    if known.policy != policy.name and not is_same_file:
+        what = f"another policy, {known.policy}"
+    elif known.inputs.get("demos") != trial.inputs.get("demos"):
         what = "other demonstrations"
     elif known.episode_seconds not in (None, _length(trial)):
         what = "episodes of another length"

@@ -236,26 +236,21 @@ class Evaluation(list[EvalResult]):
         interval is a bootstrap that draws the same demonstrations for both.
 
         Raises:
-            RunError: no engine is in both, or the starts, goals, their seed, the meshes or the length of episodes
-                differ.
+            RunError: no engine is in both, or the starts, goals, their seed, the meshes, the objects' frame or the
+                length of episodes differ.
         """
-        starts = ["sequence", "sequence_name", "object", "repetition"]
         theirs = {result.engine: result for result in other}
         rows = []
         for result in self:
             engine = result.engine
             if engine not in theirs:
                 continue
-            tables = [theirs[engine].nominal, result.nominal]
-            played = []
-            for own in (theirs[engine], result):
-                episodes = own.nominal[starts].to_numpy().tolist()
-                played.append((episodes, own.seed, own.meshes, own.episode_seconds))
-            if played[0] != played[1] or _turned_otherwise(*tables):
+            if different := _different(result, theirs[engine]):
                 raise RunError(
-                    f"{result.policy} and {theirs[engine].policy} did not play the same episodes in {engine}. "
-                    "Evaluate both with the same demonstrations, episodes, seed, objects and episode_seconds."
+                    f"{result.policy} and {theirs[engine].policy} did not play the same episodes in {engine}: "
+                    f"{different}. Evaluate both alike."
                 )
+            tables = [theirs[engine].nominal, result.nominal]
             for name in ("all", *tables[0]["object"].unique()):
                 one, two = (t if name == "all" else t[t["object"] == name] for t in tables)
                 rows += [
@@ -269,11 +264,21 @@ class Evaluation(list[EvalResult]):
         return table_text(self)
 
 
-def _turned_otherwise(one: Table, other: Table) -> bool:
-    """Whether two tables of as many episodes differ in an object's turn from its start to its goal. The names in goal
-    sets do not show that, because they are alike. Turns that an earlier version did not measure count as equal."""
-    turns = other["turn"].to_numpy(float) - one["turn"].to_numpy(float)
-    return bool((np.abs(turns) > _SAME_TURN).any())
+def _different(one: EvalResult, other: EvalResult) -> str:
+    """Return what differs between the episodes of two results, as text; empty if they are the same. The frame and turns
+    of objects that an earlier version did not state count as equal."""
+    for name in ("seed", "meshes", "episode_seconds", "object_frame"):
+        values = [getattr(result, name) for result in (one, other)]
+        if name == "meshes":  # a relative path may mean the same folder
+            values = [str(Path(folder).resolve()) if folder else "stand-ins" for folder in values]
+        if values[0] != values[1] and not (name == "object_frame" and None in values):
+            return f"{name} is {shown(values[0])} and {shown(values[1])}"
+    starts = ["sequence", "sequence_name", "object", "repetition"]
+    if one.nominal[starts].to_numpy().tolist() != other.nominal[starts].to_numpy().tolist():
+        return "not the same demonstrations and number of episodes"
+    # the names in goal sets are alike
+    turns = other.nominal["turn"].to_numpy(float) - one.nominal["turn"].to_numpy(float)
+    return "not the same goals" if (np.abs(turns) > _SAME_TURN).any() else ""
 
 
 # Tables of episodes ---------------------------------------------------------------------------------------------------

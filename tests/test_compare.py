@@ -419,12 +419,16 @@ class ScoreTest(Compared):
             ("seed", base.episodes, {"seed": 4}),
             ("fewer", base.episodes[::2], {}),
             ("goals", tuple(replace(e, turn=e.turn + 0.1) for e in base.episodes), {}),
+            ("frame", base.episodes, {"object_frame": "center"}),
+            ("meshes", base.episodes, {"meshes": "ycb"}),
+            ("same meshes", base.episodes, {"meshes": str(Path("ycb").resolve())}),
             ("sapien", base.episodes, {"engines": ("sapien",)}),
         ):
+            changes = {"object_frame": "mesh"} | changes
             self.write_results(name, replace(base, episodes=episodes), **changes)
-        good, bad, *others = (
+        good, bad, meshes, same = (
             read_evaluation(self.folder / name / "eval")
-            for name in ("good", "bad", "seed", "fewer", "goals")
+            for name in ("good", "bad", "meshes", "same meshes")
         )
         table = good.minus(bad).query("metric == 'task_progress'").set_index(["engine", "object"])
         self.assertEqual([*table.loc["mujoco"].index], ["all", SOUP, SPAM])
@@ -433,8 +437,17 @@ class ScoreTest(Compared):
         row = table.loc["mujoco", "all"]
         self.assertTrue(row["low"] <= row["mean"] <= row["high"])
         self.assertTrue((bad.minus(bad).select_dtypes(float) == 0).all(axis=None))
-        for other in others:
-            self.assertRaisesRegex(RunError, "same episodes in mujoco", good.minus, other)
+        for name, words in (
+            ("seed", "seed is 3 and 4"),
+            ("fewer", "not the same demonstrations"),
+            ("goals", "not the same goals"),
+            ("frame", "object_frame is 'mesh' and 'center'"),
+            ("meshes", "meshes is 'stand-ins' and '/.*ycb'"),
+        ):
+            other = read_evaluation(self.folder / name / "eval")
+            with self.assertRaisesRegex(RunError, f"same episodes in mujoco: {words}"):
+                good.minus(other)
+        self.assertEqual(len(meshes.minus(same)), len(good.minus(bad)))
         elsewhere = read_evaluation(self.folder / "sapien" / "eval")
         self.assertRaisesRegex(RunError, "no engine in common", good.minus, elsewhere)
 

@@ -637,13 +637,14 @@ class ResultsTest(InFolder):
 
     def test_results_of_other_episodes_are_named_before_they_are_replaced(self):
         file = self.folder / "mujoco.json"
-        write_result(self.folder, toy_result(episode_seconds=5.0), (), ())
-        before = file.read_bytes()
-        for demos, seconds, told in (
-            ("ab", 5.0, ""),
-            ("cd", 5.0, f"{file}: results of other demonstrations"),
-            ("ab", 6.0, f"{file}: results of episodes of another length"),
+        for name, demos, seconds, told in (
+            (self.policy.name, "ab", 5.0, ""),
+            ("other", "ab", 5.0, f"{file}: results of another policy, other"),
+            (self.policy.name, "cd", 5.0, f"{file}: results of other demonstrations"),
+            (self.policy.name, "ab", 6.0, f"{file}: results of episodes of another length"),
         ):
+            write_result(self.folder, toy_result(policy=name, episode_seconds=5.0), (), ())
+            before = file.read_bytes()
             logged = self.assertLogs if told else self.assertNoLogs
             with (
                 self.subTest(told),
@@ -658,7 +659,7 @@ class ResultsTest(InFolder):
             if told:
                 self.assertIn(told, logs.output[0])
                 self.assertIn("choose another folder (--out; in Python: out).", logs.output[0])
-        self.assertEqual(file.read_bytes(), before)
+            self.assertEqual(file.read_bytes(), before)
 
     def test_a_result_that_is_not_a_number_is_not_written(self):
         bad = replace(self.rollouts.episodes[0], reorientation_progress=math.nan)

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
-from xreset.env.manipulation import ManipulationEnv
+from xreset.env.manipulation import ManipulationEnv, checked_env
 from xreset.errors import XResetError
 from xreset.eval.policy_spec import PolicySpec, load_policy
 from xreset.files.checks import Mp4, PositiveFloat, obeys_rules
 from xreset.files.storage import write_whole
-from xreset.pictures.render import encode_mp4
+from xreset.pictures.render import check_film_size, encode_mp4
 
 
 @obeys_rules
@@ -37,8 +37,11 @@ def film(
 
     Raises:
         PolicyError: the policy is unknown, or cannot play in this environment.
-        XResetError: the path does not end in ``.mp4``, the world does not exist, or the film cannot be encoded.
+        XResetError: the path does not end in ``.mp4``, ``env`` is no environment, the world does not exist, or the film
+            cannot be encoded.
     """
+    env = checked_env(env)
+    check_film_size(size)
     if not 0 <= world < env.num_envs:
         raise XResetError(f"World {world} does not exist. Choose one from 0 to {env.num_envs - 1}.")
     policy = load_policy(policy)

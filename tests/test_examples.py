@@ -164,13 +164,23 @@ class FromABankTest(InOneFolder):
         self.assertLess(float(distance), 5.0, done.stdout)
 
     def test_a_policy_says_where_it_cannot_play(self):
+        graph = self.folder / "graph.onnx"
+        graph.write_bytes(xreset.load_policy("many-objects").graph)
         with self.environment(1) as env:
             for arguments, message in (
                 (
                     ("many-objects", env, "film.mp4"),
                     "many-objects is a policy of the robot 'ur7e-sharpa', not of 'openarm'",
                 ),
+                (
+                    (graph, env, "film.mp4"),
+                    "The graph is a policy of the robot 'ur7e-sharpa', not of 'openarm'",
+                ),
                 (("no-such-policy", env, "film.mp4"), "no-such-policy"),
+                (
+                    ("zero", xreset.VectorEnv(env), "film.mp4"),
+                    "^env is VectorEnv.* expected an env",
+                ),
                 (
                     ("many-objects", env, "film.gif"),
                     "^path is 'film.gif', expected a name that ends in .mp4",
@@ -178,6 +188,8 @@ class FromABankTest(InOneFolder):
             ):
                 with refuses(self, message, xreset.XResetError):
                     xreset.film(*arguments)
+            with self.assertRaisesRegex(xreset.XResetError, "^films of 641 x 480 pixels cannot be"):
+                xreset.film("many-objects", env, "film.mp4", size=(641, 480))
             with self.assertRaisesRegex(xreset.XResetError, "World 1 does not exist"):
                 xreset.film("many-objects", env, "film.mp4", world=1)
             with self.assertRaisesRegex(xreset.XResetError, "fps is 0, expected a number above"):

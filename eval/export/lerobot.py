@@ -24,7 +24,7 @@ from xreset.eval.results import Trace
 from xreset.files.progress import Progress, unseen
 from xreset.files.storage import atomic_folder, write_json
 from xreset.objects.catalogue import load_object
-from xreset.pictures.render import Renderer, Size, encode_mp4
+from xreset.pictures.render import Renderer, Size, check_film_size, encode_mp4
 from xreset.spec import RobotSpec, SceneSpec
 
 _FORMAT = tomllib.loads(Path(__file__).with_suffix(".toml").read_text())
@@ -71,10 +71,8 @@ def write_lerobot(
             "Films of cameras are wanted and not wanted. Leave out --no-video or --camera."
         )
     videos = (VIDEO, *(_DEPTH + name for name in cameras)) if video else ()
-    if video and (min(size) < 16 or size[0] % 2 or size[1] % 2):
-        raise XResetError(
-            f"films of {size[0]} x {size[1]} pixels cannot be encoded; width and height must be even, from 16 on."
-        )
+    if video:
+        check_film_size(size)
     with atomic_folder(folder) as part:
         _write(part, recording, videos, size, progress)
 

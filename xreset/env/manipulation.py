@@ -623,3 +623,10 @@ class ManipulationEnv:
             reward=self._reward,
             generator=self.generator,
         )
+
+
+def checked_env(env: ManipulationEnv) -> ManipulationEnv:
+    """Return an environment; ``XResetError`` if it is something else."""
+    if not isinstance(env, ManipulationEnv):
+        raise XResetError(f"env is {shown(env)}, expected an environment: xreset.make_env(...).")
+    return env

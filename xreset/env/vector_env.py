@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from xreset.env.manipulation import ManipulationEnv
+from xreset.env.manipulation import ManipulationEnv, checked_env
 from xreset.errors import XResetError, needs
-from xreset.files.text import shown
 from xreset.physics.tensors import where
 
 with needs("gymnasium", "gymnasium"):
@@ -112,13 +111,6 @@ class VectorEnv(gymnasium.vector.VectorEnv):
     def close_extras(self, **_: Any) -> None:
         """Close the engine."""
         self.env.close()
-
-
-def checked_env(env: ManipulationEnv) -> ManipulationEnv:
-    """Return an environment; ``XResetError`` if it is something else."""
-    if not isinstance(env, ManipulationEnv):
-        raise XResetError(f"env is {shown(env)}, expected an environment: xreset.make_env(...).")
-    return env
 
 
 def set_seed(env: ManipulationEnv, seed: int) -> None:

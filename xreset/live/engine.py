@@ -13,6 +13,7 @@ from torch import Tensor
 from xreset.env.manipulation import ManipulationEnv
 from xreset.geometry.rotations import quat_rotate
 from xreset.objects.sampling import center, surface_points
+from xreset.policy.onnx_policy import of_another_robot
 from xreset.runtime import Controller, Driver, Reading
 
 
@@ -115,7 +116,11 @@ class GraphPolicy:
         self._controller = controller
 
     def begin(self, env: ManipulationEnv) -> None:
-        """Begin an episode in every world."""
+        """Begin an episode in every world; ``PolicyError`` if the policy has other joints than the robot."""
+        contract = self._controller.contract
+        robot = env.backend.scene.robot
+        if tuple(joint["name"] for joint in contract["joints"]) != robot.joint_names:
+            raise of_another_robot("The graph", contract["robot"], robot.name)
         self._env = env
         self._driver = EngineDriver(env)
         self._center = torch.as_tensor(centers(env), device=env.device)

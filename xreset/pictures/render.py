@@ -242,6 +242,15 @@ def write_png(path: str | Path, picture: np.ndarray) -> None:
     write_whole(path, encode_png(picture))
 
 
+def check_film_size(size: Size) -> None:
+    """Refuse, with ``XResetError``, a width and height [pixels] that no film can have."""
+    width, height = size
+    if min(size) < 16 or width % 2 or height % 2:
+        raise XResetError(
+            f"films of {width} x {height} pixels cannot be encoded; width and height must be even, from 16 on."
+        )
+
+
 def encode_mp4(frames: Iterable[np.ndarray], fps: float, *, keyframes: int | None = None) -> bytes:
     """Encode a film as H.264 in an mp4 file that every browser plays.
 

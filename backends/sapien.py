@@ -147,7 +147,7 @@ class SapienWorld(World):
             pose = self._object.entity_pose
             arms = points - (pose.p + _rotation(pose.q) @ self._inertia.com)
             coefficients = np.array([self._friction[_material(owner)] for owner in owners])
-            missing = self._missing_wrench(self._last_step, arms, forces)
+            missing = self._missing_wrench(arms, forces)
             forces = forces + friction_forces(arms, forces, coefficients, *missing)
         return list(zip(owners, forces, strict=True))
 
@@ -349,16 +349,15 @@ class SapienWorld(World):
         return owners, np.array(points), np.array(impulses) / self._dt
 
     def _missing_wrench(
-        self, last_step: tuple[np.ndarray, ...], arms: np.ndarray, contact_forces: np.ndarray
+        self, arms: np.ndarray, contact_forces: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the force and torque [3] about the centre of mass that explain the rest of the change of momentum.
 
         Args:
-            last_step: see :attr:`_last_step`.
             arms: [n, 3] contact points from the centre of mass.
             contact_forces: [n, 3] known forces at these points.
         """
-        linvel, angvel, quat, force, torque = last_step
+        linvel, angvel, quat, force, torque = self._last_step
         R = _rotation(quat)
         omega = angvel.astype(np.float64)
         inertia = R @ self._inertia.matrix @ R.T

@@ -23,6 +23,7 @@ from xreset.backends.mujoco import MujocoBackend, MujocoWorld
 from xreset.backends.rigid import OTHER_LINK, TABLE, conjugate, rotate
 from xreset.errors import BackendUnavailableError, XResetError
 from xreset.eval.engines import contract
+from xreset.eval.engines.verbs import check_engines
 from xreset.physics import KnownDifference
 
 Defect = type[MujocoWorld] | type[MujocoBackend]
@@ -664,6 +665,12 @@ class Harness(InFolder):
                 self.assertEqual(result.verdict, verdict, name)
                 found = {m.where for m in result.measures if m.verdict == "failed"}
                 self.assertEqual(found, {"can"} if exact else set(), name)
+
+    def test_an_unknown_engine_is_refused_before_another_is_checked(self):
+        said = []
+        with self.assertRaisesRegex(BackendUnavailableError, "Unknown engine 'nonsense'"):
+            check_engines(["mujoco", "nonsense"], only=["free_fall"], say=said.append)
+        self.assertEqual(said, [])
 
     def test_a_backend_that_cannot_be_built_is_not_a_failed_check(self):
         def make(scene, num_worlds, *, object_index=None):

@@ -276,26 +276,20 @@ class Bench:
 
     @cached_property
     def place(self) -> tuple[float, float]:
-        """See :func:`free_place`."""
-        return free_place(self.scene)
+        """A place on the table from which an object can slide, far from the robot's base and its hand at home."""
+        robot = self.scene.robot
+        x, y = self.scene.table.center
+        half_x, half_y, _ = self.scene.table.half_size
+        palm = self.kinematics.points(self.kinematics.home, [robot.palm])[0, :2].numpy()
+        avoid = np.stack((palm, robot.base_pos[:2]))
+        xs = (x - (half_x - 0.25), x + (half_x - 0.25))
+        ys = (y - (half_y - 0.2), y + (half_y - 0.2))
+        return max(product(xs, ys), key=lambda corner: np.linalg.norm(avoid - corner, axis=1).min())
 
     def close(self) -> None:
         """Close the shared worlds."""
         if "_shared" in vars(self):
             self._shared.backend.close()
-
-
-def free_place(scene: SceneSpec) -> tuple[float, float]:
-    """Return a place on the table from which an object can slide, far from the robot's base and its hand at home."""
-    robot = scene.robot
-    x, y = scene.table.center
-    half_x, half_y, _ = scene.table.half_size
-    kinematics = Kinematics(robot)
-    palm = kinematics.points(kinematics.home, [robot.palm])[0, :2].numpy()
-    avoid = np.stack((palm, robot.base_pos[:2]))
-    xs = (x - (half_x - 0.25), x + (half_x - 0.25))
-    ys = (y - (half_y - 0.2), y + (half_y - 0.2))
-    return max(product(xs, ys), key=lambda corner: np.linalg.norm(avoid - corner, axis=1).min())
 
 
 def replace_fields(state: State, **changes: Tensor) -> State:

@@ -15,7 +15,7 @@ from xreset.files.checks import Json, JsonOrPage, Option, PositiveInt, obeys_rul
 from xreset.files.progress import NamedProgress, unseen
 from xreset.files.records import replaces
 from xreset.files.storage import file_hash, measured, write_json, write_whole
-from xreset.physics.plugins import Device
+from xreset.physics.plugins import Device, backend_class
 
 if TYPE_CHECKING:
     from xreset.eval.engines.agreement import Parity
@@ -57,9 +57,10 @@ def check_engines(
     from xreset.geometry.description import load_robot
 
     spec = load_robot(robot) if robot else conformance.scene().robot
-    runs = []
-    for name in [engines] if isinstance(engines, str) else dict.fromkeys(engines):
-        runs.append(contract.check(name, spec, device, only, say))
+    names = [engines] if isinstance(engines, str) else dict.fromkeys(engines)
+    for name in names:  # before minutes of checks
+        backend_class(name).engine_version()
+    runs = [contract.check(name, spec, device, only, say) for name in names]
     found = measured({"schema": conformance.SCHEMA, "runs": runs})
     if out is not None and Path(out).suffix.lower() == ".json":
         write_json(out, found)

@@ -1,5 +1,6 @@
 """The environment and the rollouts on the MuJoCo C engine: episodes begin and end as they should, world by world."""
 
+from contextlib import nullcontext
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -35,6 +36,7 @@ from xreset.geometry.rotations import quat_rotate
 from xreset.learning.recipes import RECIPES
 from xreset.objects.catalogue import load_object, load_objects
 from xreset.physics import State
+from xreset.physics.capture import GraphRunner
 from xreset.physics.plugins import make_backend
 from xreset.resets.distribution import ResetDistribution
 from xreset.task.config import (
@@ -291,6 +293,20 @@ class StepTest(WithEnv):
         self.assert_same(results[0][0], results[1][0])
         self.assertTrue(torch.equal(results[0][1], results[1][1]))
         self.assertFalse(torch.equal(results[0][0]["policy"], results[2][0]["policy"]))
+
+
+class GraphTest(TestCase):
+    def test_the_first_calls_wait_for_the_stream_of_their_own_device(self):
+        """Another device may be torch's current one."""
+        with (
+            patch("torch.cuda.Stream") as own,
+            patch("torch.cuda.current_stream") as current_stream,
+            patch("torch.cuda.stream", lambda _: nullcontext()),
+        ):
+            GraphRunner(torch.device("cuda:1")).run(self.id)
+        current_stream.assert_called_once_with(torch.device("cuda:1"))
+        own().wait_stream.assert_called_once_with(current_stream())
+        current_stream().wait_stream.assert_called_once_with(own())
 
 
 class ResetTest(WithEnv):

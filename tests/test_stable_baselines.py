@@ -69,6 +69,9 @@ class StableBaselinesTest(WithEnv):
             self.assertTrue(np.isfinite(value).all(), name)
             assert_array_equal(infos[0]["terminal_observation"][name], before[name][0])
         self.assertEqual(env.env.episode_length_buf.tolist(), [0] + [2] * (N - 1))
+        env.env.backend.overflow[0] = True
+        _, reward, *_ = env.step(np.full((N, env.env.num_actions), 0.1))
+        self.assertEqual([bool(value) for value in reward], [False] + [True] * (N - 1))
 
     def test_an_attribute_that_the_environment_lacks_is_refused(self):
         with warnings.catch_warnings():

@@ -8,13 +8,12 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 
-from xreset.env.manipulation import ManipulationEnv
+from xreset.env.manipulation import ManipulationEnv, checked_env
 from xreset.env.vector_env import (
     action_space,
     array,
     arrays,
     checked_action,
-    checked_env,
     observation_space,
     set_seed,
     with_sound_rows,
@@ -32,7 +31,8 @@ class StableBaselinesEnv(VecEnv):
 
     A world is reset in the step that ends its episode, as Stable-Baselines3 expects. The last observation of the
     episode is ``infos[world]["terminal_observation"]``; ``infos[world]["TimeLimit.truncated"]`` says whether its value
-    is to be bootstrapped. An episode whose simulation fails is terminated, and ``infos[world]["faulty"]`` is True.
+    is to be bootstrapped. An episode whose simulation fails is terminated without reward, and
+    ``infos[world]["faulty"]`` is True.
 
     Attributes:
         log: as of :class:`~xreset.env.vector_env.VectorEnv`.
@@ -76,6 +76,7 @@ class StableBaselinesEnv(VecEnv):
         observations, reward, done, extras = self.env.step(self._action, begin=nothing)
         observations = with_sound_rows(observations, before)
         faulty = extras["faulty"]
+        reward = reward.masked_fill(faulty, 0.0)
         self.log = extras["log"]
         truncated = extras["time_outs"].bool() & ~faulty
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]

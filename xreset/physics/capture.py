@@ -20,6 +20,7 @@ class GraphRunner:
     def __init__(self, device: torch.device, generator: torch.Generator | None = None) -> None:
         """Prepare for a device; the functions may draw from ``generator`` and from torch's own, which move on at every
         replay."""
+        self._device = device
         self.active = device.type == "cuda"
         self._generator = generator
         self._stream = torch.cuda.Stream(device) if self.active else None
@@ -37,10 +38,11 @@ class GraphRunner:
             if self._calls[name] <= self.WARM_UP:
                 # on the stream that will be captured, because autograd's nodes that outlive a call run
                 # on the stream of their first call
-                self._stream.wait_stream(torch.cuda.current_stream())
+                caller = torch.cuda.current_stream(self._device)
+                self._stream.wait_stream(caller)
                 with torch.cuda.stream(self._stream):
                     function()
-                torch.cuda.current_stream().wait_stream(self._stream)
+                caller.wait_stream(self._stream)
                 return
             graph = torch.cuda.CUDAGraph()
             if self._generator is not None:

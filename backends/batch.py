@@ -71,8 +71,7 @@ class BatchBackend(Backend):
         )
         self.coming = State.initial(scene, self.object_index).to(self.device).clone()
         self.parameters = Parameters.nominal(scene, self.object_index).to(self.device).given()
-        self._every_world = torch.arange(num_worlds, device=self.device)
-        self.chosen = torch.ones_like(self._every_world, dtype=torch.bool)
+        self.chosen = torch.ones(num_worlds, dtype=torch.bool, device=self.device)
         self._state = self.coming.clone()
         links, contacts, health = no_readings(scene.robot, num_worlds)
         self._links: Links = links.to(self.device)
@@ -166,7 +165,7 @@ class BatchBackend(Backend):
 
     def _choose(self, worlds: Tensor | None) -> Tensor:
         """Set the mask of the worlds to change, and return their indices [M]."""
-        index = self._every_world if worlds is None else self._indices(worlds)
+        index = self._indices(worlds)
         self.chosen.zero_()
         self.chosen[index] = True
         return index

@@ -249,7 +249,7 @@ class PoolBackend(Backend):
             raise
 
     def set_state(self, state: State, worlds: Tensor | None = None) -> None:
-        index = self._selected(worlds)
+        index = self._indices(worlds).numpy()
         for name, value in vars(self._checked_state(state, len(index))).items():
             self._arrays[name][index] = value
         self._arrays["wrench"][index] = 0.0
@@ -268,7 +268,7 @@ class PoolBackend(Backend):
 
     def _set(self, name: Parameter, value: Tensor, worlds: Tensor | None) -> None:
         self._require(name)
-        index = self._selected(worlds)
+        index = self._indices(worlds).numpy()
         present = self._arrays[name]
         shape = (len(index), *present.shape[1:])
         present[index] = self._checked_parameter(name, value, shape).numpy()
@@ -280,11 +280,6 @@ class PoolBackend(Backend):
 
         names = [field.name for field in fields(bundle)]
         return bundle(**{name: torch.from_numpy(self._arrays[prefix + name]) for name in names})
-
-    def _selected(self, worlds: Tensor | None) -> np.ndarray:
-        if worlds is None:
-            return np.arange(self.num_worlds)
-        return self._indices(worlds).numpy()
 
     def _command(self, method: str, worlds: np.ndarray | None = None, argument: Any = None) -> None:
         """Run a command in the workers."""

@@ -72,19 +72,19 @@ def _independent(values: np.ndarray, groups: np.ndarray) -> int:
     return count if count > 1 else len(values)
 
 
-def bootstrap_ci95(values: np.ndarray, groups: np.ndarray | None = None) -> Interval:
+def bootstrap_ci95(values: np.ndarray, groups: np.ndarray) -> Interval:
     """Return the 95 % percentile bootstrap interval of the mean. The same values give the same interval.
 
     Args:
         values: [E] one value per episode.
         groups: [E] demonstration of each episode. Episodes of one demonstration resemble one another, so whole
-            demonstrations are drawn (cluster bootstrap); with a single one, or None, episodes are drawn.
+            demonstrations are drawn (cluster bootstrap); with a single one, episodes are drawn.
     """
     values = np.asarray(values, dtype=float)
     if len(values) < 2:
         return float(values.mean()), float(values.mean())
     rng = np.random.default_rng(0)
-    if groups is None or len(np.unique(groups)) < 2:
+    if len(np.unique(groups)) < 2:
         groups = np.arange(len(values))
     _, number = np.unique(groups, return_inverse=True)
     sums = np.bincount(number, values)

@@ -359,7 +359,7 @@ class BootstrapTest(TestCase):
         for _ in range(200):
             groups = np.repeat(np.arange(15), 5)
             values = rng.normal(0, 1, 15)[groups] + 0.1 * rng.normal(size=75)
-            low, high = bootstrap_ci95(values, groups if cluster else None)
+            low, high = bootstrap_ci95(values, groups if cluster else np.arange(len(values)))
             hits += low <= 0 <= high
         return hits / 200
 
@@ -374,7 +374,7 @@ class BootstrapTest(TestCase):
         groups = np.concatenate((np.repeat(np.arange(20), 9), 20 + np.arange(20)))
         low, high = bootstrap_ci95((groups < 20).astype(float), groups)
         self.assertTrue(0.75 < low < 0.9 < high < 1.0, (low, high))
-        self.assertEqual(bootstrap_ci95(np.array([0.3])), (0.3, 0.3))
+        self.assertEqual(bootstrap_ci95(np.array([0.3]), np.zeros(1)), (0.3, 0.3))
         alone = bootstrap_ci95(np.array([1.0, 0, 1, 0]), np.zeros(4))
         self.assertTrue(0 <= alone[0] < 0.5 < alone[1] <= 1)
 

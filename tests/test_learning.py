@@ -431,6 +431,7 @@ class ConfigTest(TestCase):
             ),
             (PpoConfig, {"discount": 1.01}, "discount is 1.01, expected a number from 0 to 1"),
             (PpoConfig, {"entropy": float("nan")}, "entropy is nan"),
+            (PpoConfig, {"entropy": 10**400}, "entropy is 1000.*, expected .* finite"),
             (PpoConfig, {"desired_kl": float("inf")}, "desired_kl is inf, expected .* finite"),
             (ModelConfig, {"initial_std": 0.0}, "initial_std is 0.0, expected a number above 0"),
             (

@@ -35,7 +35,7 @@ def _show_checks(runs: Sequence[Mapping[str, Any]], options: Mapping[str, Any]) 
     for run in runs:
         verdicts += [check["verdict"] for check in run["checks"]]
     if failed := verdicts.count("failed"):
-        console.print(f"{failed} checks failed", style="bold red")
+        console.print(f"{quantity(failed, 'check')} failed", style="bold red")
         raise SystemExit(1)
     console.print("no check failed", style="bold green")
 

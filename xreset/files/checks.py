@@ -222,7 +222,7 @@ def _broken_rules(marks: Iterable[Any], value: Any) -> list[Rule]:
 def _holds(rule: Rule, value: Any) -> bool:
     try:
         return bool(rule.holds(value))
-    except (TypeError, ValueError):  # of another type, such as a text in place of a number
+    except (TypeError, ValueError, OverflowError):  # of another type, or an integer of 400 digits
         return False
 
 

@@ -471,11 +471,13 @@ class Backend(ABC):
         if self._closed:
             raise XResetError(f"The engine {self.name!r} is closed. Build a new one.")
 
-    def _indices(self, worlds: Tensor) -> Tensor:
-        """Return indices of worlds [M] on the backend's device; ``WrongValueError`` for anything else. On a GPU, which
-        would have to be waited for, their range is not checked."""
+    def _indices(self, worlds: Tensor | None) -> Tensor:
+        """Return indices of worlds [M] on the backend's device, of all if None; ``WrongValueError`` for anything else.
+        On a GPU, which would have to be waited for, their range is not checked."""
         import torch
 
+        if worlds is None:
+            return torch.arange(self.num_worlds, device=self.device)
         index = torch.as_tensor(worlds, device=self.device)
         is_whole = index.dtype != torch.bool and not index.is_floating_point()
         is_valid = index.ndim == 1 and (is_whole or not len(index))

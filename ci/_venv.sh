@@ -30,7 +30,8 @@ if [ ! -e "$stamp" ]; then
     rm -rf .venv  # made with another version of Python
   fi
   [ -x .venv/bin/python ] || "$python" -m venv .venv
-  install() { .venv/bin/python -m pip install --disable-pip-version-check --only-binary :all: "$@"; }
+  # --no-compile: pip compiles 245 MB of Python on one core; Python compiles the third that it imports, on all cores
+  install() { .venv/bin/python -m pip install --disable-pip-version-check --only-binary :all: --no-compile "$@"; }
   # torch first: what depends on it then takes this build
   if nvidia-smi -L > /dev/null 2>&1; then
     install torch==2.13.0
@@ -46,4 +47,5 @@ if [ ! -e "$stamp" ]; then
   rm -f .venv/.xreset-*
   touch "$stamp"
 fi
+unset PYTHONDONTWRITEBYTECODE  # else every process compiles all packages that it imports
 export PATH="$root/.venv/bin:$PATH"

@@ -23,7 +23,13 @@ from xreset.geometry.kinematics import Kinematics
 from xreset.physics.plugins import DESCRIPTION, robot_folder
 from xreset.retarget.arm.config import ArmSearch
 from xreset.retarget.arm.model import ArmModel, ArmTargets
-from xreset.retarget.arm.solve import branches, splice, spread_over, track
+from xreset.retarget.arm.solve import (
+    _first_frame_solutions,
+    branches,
+    splice,
+    spread_over,
+    track,
+)
 from xreset.retarget.validity import Thresholds, classify
 from xreset.robot_tools import place as placing
 from xreset.robot_tools.placement import Finalist, PlaceConfig, write_placement
@@ -57,6 +63,14 @@ class PlaceTest(InFolder):
         self.assertGreater(self.reached[0], 0.95)
         self.assertGreater(self.reached[1], 0.1)
         self.assertEqual(placing.reach(self.lost, self.wrists), (0.0, 0.0))
+
+    def test_a_pose_that_is_missed_is_not_solved_again(self):
+        """Other paths and frames of a sequence may help; a frame alone has the same solutions again."""
+        solutions = "xreset.retarget.arm.solve._first_frame_solutions"
+        with patch(solutions, wraps=_first_frame_solutions) as solved:
+            _, measures = track(ArmModel(self.lost), self.wrists[:2], Thresholds())
+        self.assertTrue(classify(measures, Thresholds()).all())
+        solved.assert_called_once()
 
     def test_a_robot_in_a_wrong_place_is_moved_to_where_it_reaches(self):
         seen = []

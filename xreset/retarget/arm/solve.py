@@ -80,7 +80,7 @@ def track(
     measures = problem.measures(joints)
     reason = classify(measures, thresholds)
     failing = (reason > REASONS.index("hand error")).any(dim=1).nonzero()[:, 0]
-    if len(failing) and (problem.annotated.shape[1] > 1 or problem.config.reseeds):
+    if len(failing) and problem.annotated.shape[1] > 1:  # of a single frame all solutions are known
         part = problem[failing]
         better = _better_paths(part, forwards[failing], joints[failing], worth[failing])
         joints[failing] = better
@@ -136,12 +136,11 @@ def _better_paths(problem: ArmProblem, paths: Paths, joints: Tensor, worth: Tens
         joints: [S, T, n] the best of these paths.
         worth: [S] worth of the best path.
     """
-    if problem.annotated.shape[1] > 1:
-        turned = problem.reversed()
-        backwards = branches(turned)
-        back, other = best_path(turned, backwards)
-        joints = torch.where((other > worth)[:, None, None], back.flip(1), joints)
-        paths = Paths.cat((paths, backwards.map(lambda x: x.flip(2))), dim=1)
+    turned = problem.reversed()
+    backwards = branches(turned)
+    back, other = best_path(turned, backwards)
+    joints = torch.where((other > worth)[:, None, None], back.flip(1), joints)
+    paths = Paths.cat((paths, backwards.map(lambda x: x.flip(2))), dim=1)
     if problem.config.reseeds:
         reason = problem.reasons(joints)
         missed = torch.isin(reason, _WRIST_MISSED)

@@ -477,7 +477,7 @@ def matrix_to_quat(R: np.ndarray) -> np.ndarray:
     4 q q^T is linear in the matrix; its row with the largest diagonal element is a multiple of q.
     """
     flat = R.reshape(-1, 9)
-    products = (flat @ _QUAT_PRODUCTS + np.eye(4).ravel()).reshape(-1, 4, 4)
+    products = (flat @ _QUAT_PRODUCTS + _ONES).reshape(-1, 4, 4)
     best = products.diagonal(axis1=1, axis2=2).argmax(axis=1)
     q = products[np.arange(len(flat)), best]
     q /= np.sqrt((q * q).sum(axis=1, keepdims=True))
@@ -501,6 +501,9 @@ def _quat_products() -> np.ndarray:
 
 
 _QUAT_PRODUCTS = _quat_products()
+_ONES = np.eye(4).ravel()
+EYE = np.eye(3)
+"""Made once, because making it takes longer than its sum with a matrix."""
 
 
 def nearer(q: np.ndarray, reference: np.ndarray) -> np.ndarray:
@@ -531,7 +534,7 @@ def friction_forces(
     limits = np.sqrt((normal_forces * normal_forces).sum(axis=1))
     normals = normal_forces / limits[:, None]
     # Row j of contact i: its force if its share is 1 along j, without the part along the normal.
-    tangential = np.eye(3) - normals[:, :, None] * normals[:, None, :]
+    tangential = EYE - normals[:, :, None] * normals[:, None, :]
     forces = (limits * coefficients)[:, None, None] * tangential
     wrenches = np.concatenate([forces, cross(arms[:, None], forces)], axis=2).reshape(-1, 6)
     shares, *_ = np.linalg.lstsq(wrenches.T, np.concatenate([force, torque]), rcond=1e-6)

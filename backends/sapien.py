@@ -30,6 +30,7 @@ import numpy as np
 
 from xreset.backends.pool import PoolBackend, World
 from xreset.backends.rigid import (
+    EYE,
     OTHER_LINK,
     TABLE,
     Inertia,
@@ -431,8 +432,8 @@ def _rotation(quat: np.ndarray) -> np.ndarray:
     """[3, 3] rotation matrix, in double precision, of a unit quaternion [4], whose products keep its precision."""
     products = np.outer(quat, quat)
     squares = products[1:, 1:].astype(np.float64)
-    skew = cross(products[0, 1:], np.eye(3)).T
-    return np.eye(3) + 2.0 * (skew + squares - np.trace(squares) * np.eye(3))
+    skew = cross(products[0, 1:], EYE).T
+    return EYE + 2.0 * (skew + squares - np.trace(squares) * EYE)
 
 
 def _x_to(axis: np.ndarray) -> np.ndarray:

@@ -27,11 +27,12 @@ QUICK = (
 """Tests of `--quick`, which need neither physics nor all of the package: modules, classes or methods."""
 
 SLOW = (
-    "conformance_engines", "import_robot", "examine", "training", "examples", "backends_mujoco", "study", "learns",
-    "shipped_policy", "objects", "deploy", "arm", "parity", "cli", "report", "retarget", "distributed",
-    "mujoco_warp_depth", "demos", "play", "play_browser", "try_page",
+    "conformance_engines", "import_robot", "examine", "training", "examples", "study", "learns", "shipped_policy",
+    "objects", "deploy", "arm", "parity", "cli", "report", "retarget", "distributed", "demos", "play", "play_browser",
+    "try_page", "backends_mujoco", "mujoco_warp_depth",
 )  # fmt: skip
-"""Modules that begin first, so that none of them is alone at the end."""
+"""Modules that begin first, so that none of them is alone at the end. The last two take kernels of the first from the
+cache."""
 
 MOST_PROCESSES = 4
 """Most test processes at a time: each takes up to 2 GB."""

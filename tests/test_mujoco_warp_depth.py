@@ -62,6 +62,9 @@ class Depth(TestCase):
         qpos = poses(np.random.default_rng(0))
         with wp.ScopedDevice("cpu"):
             m = mjw.put_model(model)
+            m.opt.warn_overflow = (
+                0  # as the backend has it, so that its kernel need not be compiled again
+            )
             d = mjw.make_data(model, nworld=WORLDS, nconmax=8, njmax=32)
             d.qpos = wp.array(qpos, dtype=float)
             for stage in (mjw.kinematics, mjw.com_pos, mjw.collision):
@@ -104,6 +107,12 @@ class OtherVersions(TestCase):
             correct_engine()
             self.assertIs(engine_step(wp.get_device("cpu")).func, mujoco_warp_step.forked_step)
         self.assertIs(collision_convex.multicontact, mujoco_warp_depth.multicontact_with_depth)
+
+    def test_the_engines_source_is_parsed_once(self):
+        engine_step(wp.get_device("cpu"))
+        with patch("inspect.getsource") as parse:
+            engine_step(wp.get_device("cpu"))
+        parse.assert_not_called()
 
     def test_another_step_is_left_to_the_engine_and_said(self):
         with (

@@ -431,7 +431,6 @@ class ConfigTest(TestCase):
             ),
             (PpoConfig, {"discount": 1.01}, "discount is 1.01, expected a number from 0 to 1"),
             (PpoConfig, {"entropy": float("nan")}, "entropy is nan"),
-            (PpoConfig, {"entropy": 10**400}, "entropy is 1000.*, expected .* finite"),
             (PpoConfig, {"desired_kl": float("inf")}, "desired_kl is inf, expected .* finite"),
             (ModelConfig, {"initial_std": 0.0}, "initial_std is 0.0, expected a number above 0"),
             (
@@ -445,11 +444,8 @@ class ConfigTest(TestCase):
                 {"random_gravity": "false"},
                 "random_gravity is 'false', expected True or False",
             ),
-            (
-                ResetConfig,
-                {"object_share": {"soup": "3"}},
-                "object_share is .*expected names of objects and numbers above 0",
-            ),
+            (ResetConfig, {"object_share": {"soup": "3"}}, "expected names of .* numbers above 0"),
+            (ResetConfig, {"object_share": {"soup": 10**400}}, "expected .* numbers above 0"),
             (
                 TaskConfig,
                 {"termination": TerminationConfig(episode_seconds=0.01)},

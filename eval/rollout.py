@@ -46,9 +46,6 @@ TRACE_INTERVAL = 0.05
 MakeBackend = Callable[[SceneSpec, int, Tensor], Backend]
 """Makes the worlds of a scene, given their number and the index of the object in each world [N]."""
 
-SLOW_ON_CPU = frozenset({"mujoco-warp"})
-"""Backends that need a GPU to play many episodes."""
-
 
 @frozen
 class Engine:
@@ -64,7 +61,7 @@ class Engine:
     @property
     def slow(self) -> bool:
         """Whether it is too slow on its device to play many episodes."""
-        return self.name in SLOW_ON_CPU and self.device == "cpu"
+        return self.name == "mujoco-warp" and self.device == "cpu"
 
 
 def engine(name: str, *, device: str = "cpu", **options: Any) -> Engine:

@@ -9,7 +9,7 @@ from typing import Any
 from rich.text import Text
 
 from xreset.backends import conformance, pool
-from xreset.physics.plugins import backend_class, backend_status, make_backend
+from xreset.physics.plugins import backend_class, device_for, make_backend
 from xreset.spec import RobotSpec, SceneSpec
 
 Say = Callable[[str | Text], None]
@@ -28,19 +28,21 @@ def check(
         say: called with lines for people: every measured number of checks that are named, else the one nearest to its
             tolerance.
     """
-    status = backend_status(name)
-    used = device if device.split(":")[0] in status.device else "cpu"
-    make = _maker(name, used)  # refuses an unknown engine, so it comes before the headline
-    what = f" {status.version}, {robot.name}, {used}: verdict, check, and what came nearest to its tolerance"
+    engine = backend_class(name)
+    version = engine.engine_version()
+    used = device_for(name, device)
+    what = (
+        f" {version}, {robot.name}, {used}: verdict, check, and what came nearest to its tolerance"
+    )
     say(Text.assemble((name, "bold"), what))
     report = partial(_say_result, every=bool(only), say=say)
-    results = conformance.run(make, robot=robot, only=only or None, report=report)
+    results = conformance.run(_maker(name, used), robot=robot, only=only or None, report=report)
     return {
         "engine": name,
-        "engine_version": status.version,
+        "engine_version": version,
         "robot": robot.name,
         "device": used,
-        "capabilities": sorted(backend_class(name).capabilities),
+        "capabilities": sorted(engine.capabilities),
         "seconds": round(sum(result.seconds for result in results), 3),
         "checks": [result.as_dict() for result in results],
     }

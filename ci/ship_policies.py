@@ -98,8 +98,10 @@ def main() -> None:
     made = set()
     for argument in sys.argv[1:]:
         name, _, run = argument.partition("=")
-        (FOLDER / f"{name}.onnx").write_bytes(halved(load_policy(run).exported()))
-        (FOLDER / f"{name}.pt").write_bytes(halved_checkpoint(Path(run)))
+        network = halved(load_policy(run).exported())
+        checkpoint = halved_checkpoint(Path(run))
+        (FOLDER / f"{name}.onnx").write_bytes(network)
+        (FOLDER / f"{name}.pt").write_bytes(checkpoint)
         made.add(name)
     for name, file in shipped().items():
         policy = load_policy(file)

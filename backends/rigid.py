@@ -477,7 +477,7 @@ def matrix_to_quat(R: np.ndarray) -> np.ndarray:
     4 q q^T is linear in the matrix; its row with the largest diagonal element is a multiple of q.
     """
     flat = R.reshape(-1, 9)
-    products = (flat @ _QUAT_PRODUCTS + _ONES).reshape(-1, 4, 4)
+    products = (flat @ _QUAT_PRODUCTS + _EYE_4).reshape(-1, 4, 4)
     best = products.diagonal(axis1=1, axis2=2).argmax(axis=1)
     q = products[np.arange(len(flat)), best]
     q /= np.sqrt((q * q).sum(axis=1, keepdims=True))
@@ -501,7 +501,7 @@ def _quat_products() -> np.ndarray:
 
 
 _QUAT_PRODUCTS = _quat_products()
-_ONES = np.eye(4).ravel()
+_EYE_4 = np.eye(4).ravel()
 EYE = np.eye(3)
 """Made once, because making it takes longer than its sum with a matrix."""
 

@@ -62,9 +62,8 @@ class Depth(TestCase):
         qpos = poses(np.random.default_rng(0))
         with wp.ScopedDevice("cpu"):
             m = mjw.put_model(model)
-            m.opt.warn_overflow = (
-                0  # as the backend has it, so that its kernel need not be compiled again
-            )
+            # as the backend has it, so that its kernel need not be compiled again
+            m.opt.warn_overflow = 0
             d = mjw.make_data(model, nworld=WORLDS, nconmax=8, njmax=32)
             d.qpos = wp.array(qpos, dtype=float)
             for stage in (mjw.kinematics, mjw.com_pos, mjw.collision):

@@ -503,7 +503,7 @@ def _quat_products() -> np.ndarray:
 _QUAT_PRODUCTS = _quat_products()
 _EYE_4 = np.eye(4).ravel()
 EYE = np.eye(3)
-"""Made once, because making it takes longer than its sum with a matrix."""
+"""[3, 3] Unit matrix. It is made once, because making it takes longer than adding it."""
 
 
 def nearer(q: np.ndarray, reference: np.ndarray) -> np.ndarray:

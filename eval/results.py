@@ -275,7 +275,7 @@ def _different(one: EvalResult, other: EvalResult) -> str:
             return f"{name} is {shown(values[0])} and {shown(values[1])}"
     starts = ["sequence", "sequence_name", "object", "repetition"]
     if one.nominal[starts].to_numpy().tolist() != other.nominal[starts].to_numpy().tolist():
-        return "not the same demonstrations and number of episodes"
+        return "not the same demonstrations, or not as many episodes"
     # the names in goal sets are alike
     turns = other.nominal["turn"].to_numpy(float) - one.nominal["turn"].to_numpy(float)
     return "not the same goals" if (np.abs(turns) > _SAME_TURN).any() else ""

@@ -25,8 +25,8 @@ Motion = Callable[[Bench, Worlds, Sequence[int]], tuple[State, Tensor]]
 
 
 def resting_weight(bench: Bench) -> Measured:
-    """Put objects on the table: no force right after setting; after half a second the table carries their weight, and
-    goes on to in the worlds that are not set then."""
+    """Put objects on the table: no force right after setting; after half a second the table carries their weight.
+    Setting some of the worlds then leaves the forces of the others as they are."""
     worlds = bench.worlds()
     start = bench.start()
     fresh = worlds.contacts()

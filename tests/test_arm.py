@@ -24,8 +24,8 @@ from xreset.physics.plugins import DESCRIPTION, robot_folder
 from xreset.retarget.arm.config import ArmSearch
 from xreset.retarget.arm.model import ArmModel, ArmTargets
 from xreset.retarget.arm.solve import (
-    _first_frame_solutions,
     branches,
+    solve,
     splice,
     spread_over,
     track,
@@ -66,8 +66,7 @@ class PlaceTest(InFolder):
 
     def test_a_pose_that_is_missed_is_not_solved_again(self):
         """Other paths and frames of a sequence may help; a frame alone has the same solutions again."""
-        solutions = "xreset.retarget.arm.solve._first_frame_solutions"
-        with patch(solutions, wraps=_first_frame_solutions) as solved:
+        with patch("xreset.retarget.arm.solve.solve", wraps=solve) as solved:
             _, measures = track(ArmModel(self.lost), self.wrists[:2], Thresholds())
         self.assertTrue(classify(measures, Thresholds()).all())
         solved.assert_called_once()

@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 from torch.testing import assert_close
 
 from xreset.geometry.rotations import (
+    matrix_to_axis_angle,
     matrix_to_quat,
     quat_angle,
     quat_from_axis_angle,
@@ -64,6 +65,14 @@ class AgainstScipy(unittest.TestCase):
         for tiny in (0.0, 1e-10):
             vector = np.array([[0.0, tiny, 0.0]])
             self.assert_near(quat_to_axis_angle, vector, [[1.0, 0.0, tiny / 2, 0.0]])
+
+    def test_rotation_vectors_of_matrices_up_to_half_turns(self):
+        for size in (0.0, 1e-10, 1e-6, 1.0, 3.0, np.pi - 4e-3, np.pi - 1e-9, np.pi):
+            axes = self.points / np.linalg.norm(self.points, axis=1, keepdims=True)
+            matrices = Rotation.from_rotvec(size * axes).as_matrix()
+            turned = Rotation.from_rotvec(matrix_to_axis_angle(torch.as_tensor(matrices)).numpy())
+            difference = turned.inv() * Rotation.from_rotvec(size * axes)
+            self.assertLess(difference.magnitude().max(), 1e-12, size)
 
     def test_pose_in_a_frame(self):
         a, b = (torch.as_tensor(r.as_quat(scalar_first=True)) for r in (self.a, self.b))

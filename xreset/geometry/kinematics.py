@@ -47,11 +47,8 @@ class _Step(NamedTuple):
     prismatic: bool
     offset: Tensor
     """[3] origin of the joint in the parent's frame."""
-    rotations: Tensor
-    """[3, 3] R; for a revolute joint [3, 9] (R, R K, R K^2) with K the axis' cross-product matrix. At an angle a the
-    rotation is R + sin(a) R K + (1 - cos(a)) R K^2 (Rodrigues' formula)."""
-    axis: Tensor
-    """[3] joint axis in the parent's frame."""
+    rotation: Tensor
+    """[3, 3] of the link in the parent's frame, at position 0."""
 
 
 class Twists(NamedTuple):
@@ -75,6 +72,12 @@ class _Movers(NamedTuple):
 
     rows: list[int]
     """Rows among the moving joints."""
+    rotations: tuple[Tensor, Tensor, Tensor]
+    """[m, 1, 3, 3] R, R K and R K^2 with R the child's rotation in the parent's frame at position 0, and K the axis'
+    cross-product matrix, 0 where a joint slides. At an angle a the rotation is R + sin(a) R K + (1 - cos(a)) R K^2
+    (Rodrigues' formula)."""
+    axes: Tensor
+    """[m, 3, 1] joint axes in the children's frames."""
     carried: Tensor
     """[links, m] 1: the joint moves the link; 0: it does not."""
     turns: Tensor
@@ -100,8 +103,6 @@ class _Chain(NamedTuple):
     """Rows of the links."""
     joints: Tensor
     """[m] rows of the moving joints' children."""
-    axes: Tensor
-    """[m, 3, 1] joint axes in the children's frames."""
     movers: _Movers
     """The moving joints."""
 
@@ -214,18 +215,12 @@ class Kinematics:
         for i, joint in enumerate(joints, start=1):
             parent = self._link_index[joint.parent]
             self._above[i] |= self._above[parent]
-            R = joint.T_parent_joint[:3, :3]
-            rotations = R
-            if joint.type == "revolute":
-                K = np.cross(np.eye(3), joint.axis)  # K v = axis x v
-                rotations = np.concatenate((R, R @ K, R @ K @ K), axis=1)
             step = _Step(
                 parent=parent,
                 moving=row.get(joint.name, -1),
                 prismatic=joint.type == "prismatic",
                 offset=self.array(joint.T_parent_joint[:3, 3]),
-                rotations=self.array(rotations),
-                axis=self.array(R @ joint.axis),
+                rotation=self.array(joint.T_parent_joint[:3, :3]),
             )
             self._steps.append(step)
         self._moved = cache(self._moved_by_joints)
@@ -236,11 +231,18 @@ class Kinematics:
         children = [self._link_index[joint.child] for joint in self._moving]
         carried = self._above[np.ix_(links, children)]
         rows = carried.any(axis=0).nonzero()[0].tolist()
-        turns = [self._moving[row].type == "revolute" for row in rows]
+        joints = [self._moving[row] for row in rows]
+        turns = np.array([joint.type == "revolute" for joint in joints]).reshape(-1, 1)
+        axes = np.array([joint.axis for joint in joints]).reshape(-1, 3)
+        R = np.array([joint.T_parent_joint[:3, :3] for joint in joints]).reshape(-1, 3, 3)
+        K = np.cross(np.eye(3), (turns * axes)[:, None])  # K v = axis x v
+        rotations = [self.array(each)[:, None] for each in (R, R @ K, R @ K @ K)]
         return _Movers(
             rows=rows,
+            rotations=(rotations[0], rotations[1], rotations[2]),
+            axes=self.array(axes)[..., None],
             carried=self.array(carried[:, rows]),
-            turns=self.array(turns)[:, None],
+            turns=self.array(turns),
             coupling=self._coupling[rows],
         )
 
@@ -377,7 +379,7 @@ class Kinematics:
         T_joints = T.index_select(1, chain.joints)
         movers = chain.movers
         rates = qd @ movers.coupling.T
-        moved = (T_joints[..., :3, :3] @ chain.axes)[..., 0] * rates[..., None]
+        moved = (T_joints[..., :3, :3] @ movers.axes)[..., 0] * rates[..., None]
         turned = movers.turns * moved
         angular = movers.carried @ turned
         # what each joint gives to the point of its links that is at the origin of the world
@@ -420,7 +422,6 @@ class Kinematics:
             ancestors=ancestors,
             links=self._indices([row_of[link] for link in links]),
             joints=self._indices([row_of[self._link_index[joint.child]] for joint in joints]),
-            axes=self.array([joint.axis for joint in joints])[..., None],
             movers=movers,
         )
 
@@ -453,37 +454,38 @@ class Kinematics:
             raise ValueError(
                 f"q has {q.shape[-1]} joint positions, expected {len(self.joint_names)}: {self.joint_names}"
             )
-        values = q.reshape(-1, q.shape[-1]) @ self._coupling.T + self._constant  # [B, M]
-        sines = self._library.sin(values)
-        versines = 1.0 - self._library.cos(values)
+        movers = self._moved(tuple(wanted))
+        constant = self._constant[movers.rows]
+        values = movers.coupling @ q.reshape(-1, q.shape[-1]).T + constant[:, None]  # [m, B]
+        R, RK, RKK = movers.rotations
+        sines = self._library.sin(values)[..., None, None]
+        versines = 1.0 - self._library.cos(values)[..., None, None]
+        turned = R + sines * RK + versines * RKK  # [m, B, 3, 3]
         root = self.base if base is None else base
         root: Any = self._library.broadcast_to(root, (*q.shape[:-1], 4, 4)).reshape(-1, 4, 4)
         rotations = {0: root[:, :3, :3]}
         positions = {0: root[:, :3, 3]}
-        axes = [root[:, :0, :3]]
-        origins = [root[:, :0, :3]]
+        children = []
         needed = self._above[list(wanted)].any(axis=0)
         for i, step in enumerate(self._steps, start=1):
             if not needed[i]:
                 continue
             parent = rotations[step.parent]
             origin = positions[step.parent] + parent @ step.offset
-            rotation = parent @ step.rotations
-            joint = step.moving
-            if joint >= 0:
-                axis = parent @ step.axis
-                axes.append(axis[:, None])
-                origins.append(origin[:, None])
+            if step.moving < 0:
+                rotations[i] = parent @ step.rotation
+            else:
+                row = len(children)
+                children.append(i)
+                rotations[i] = parent @ turned[row]
                 if step.prismatic:
-                    origin = origin + axis * values[:, joint, None]
-                else:
-                    R, RK, RKK = (rotation[..., i : i + 3] for i in (0, 3, 6))
-                    rotation = (
-                        R + sines[:, joint, None, None] * RK + versines[:, joint, None, None] * RKK
-                    )
-            rotations[i] = rotation
+                    slid = movers.axes[row] * values[row, :, None, None]
+                    origin = origin + (rotations[i] @ slid)[..., 0]
             positions[i] = origin
-        rot = self._library.stack([rotations[i] for i in wanted], axis=1)
-        pos = self._library.stack([positions[i] for i in wanted], axis=1)
-        join = self._library.concatenate
-        return rot, pos, join(axes, axis=1), join(origins, axis=1)
+        stack = self._library.stack
+        rot = stack([rotations[i] for i in wanted], axis=1)
+        pos = stack([positions[i] for i in wanted], axis=1)
+        if not children:
+            return rot, pos, pos[:, :0], pos[:, :0]
+        axes = (stack([rotations[i] for i in children], axis=1) @ movers.axes)[..., 0]
+        return rot, pos, axes, stack([positions[i] for i in children], axis=1)

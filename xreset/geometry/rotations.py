@@ -103,6 +103,21 @@ def matrix_to_quat(R: Tensor) -> Tensor:
     return quat_normalize(candidates.gather(-2, best).squeeze(-2))
 
 
+def matrix_to_axis_angle(R: Tensor) -> Tensor:
+    """[..., 3] rotation vector (axis times angle in [0, pi], rad) of a rotation matrix [..., 3, 3].
+
+    With a fifth of the operations of the way through quaternions, which is taken next to a half turn, where R is nearly
+    symmetric.
+    """
+    trace = R.diagonal(dim1=-2, dim2=-1).sum(dim=-1, keepdim=True)  # 1 + 2 cos(angle)
+    if (trace < -1.0 + 1e-5).any():
+        return quat_to_axis_angle(matrix_to_quat(R))
+    v = (R - R.mT).flatten(-2)[..., [7, 2, 3]]  # 2 sin(angle) times the axis
+    size = v.norm(dim=-1, keepdim=True)
+    angle = torch.atan2(size, trace - 1.0)
+    return v * torch.where(size > 1e-9, angle / size.clamp_min(1e-12), 0.5)
+
+
 def homogeneous(R: Tensor, pos: Tensor) -> Tensor:
     """[..., 4, 4] pose of a rotation matrix [..., 3, 3] and a position [..., 3]."""
     T = pos.new_zeros(*pos.shape[:-1], 4, 4)

@@ -16,7 +16,7 @@ from xreset.files.checks import frozen
 from xreset.geometry.balls import bounding_balls, joined, members
 from xreset.geometry.collision import SelfCollision, height_above_table, table_points
 from xreset.geometry.kinematics import Kinematics
-from xreset.geometry.rotations import matrix_to_quat, matvec, quat_angle
+from xreset.geometry.rotations import matrix_to_quat, matvec, quat_angle, quat_to_matrix
 from xreset.physics.tensors import Tensors
 from xreset.retarget.arm.config import ArmSearch
 from xreset.retarget.validity import Measures, Thresholds, classify
@@ -75,8 +75,8 @@ class LowPoints(Tensors):
     """[A] index of the link that carries the point."""
     height: Tensor
     """[A] height of the robot's shape above the table at this point [m]."""
-    lever: Tensor
-    """[A, 3] from the carrier's origin to the center of the lowest ball, along the world's axes [m]."""
+    point: Tensor
+    """[A, 3] center of the lowest ball [m]."""
 
 
 class ArmModel:
@@ -139,28 +139,44 @@ class ArmModel:
             poses[..., : len(moving), :, :] = self.hand.link_poses(hand_joints, moving)
         return poses
 
-    def low_points(self, pos: Tensor, rot: Tensor, hand_poses: Tensor, below: float) -> LowPoints:
+    def middles(self, hand_poses: Tensor) -> Tensor:
+        """[..., G, 3] centers of balls around the support points of each link, in its carrier's frame, at poses
+        [..., G, 4, 4] of :meth:`hand_poses`."""
+        return hand_poses[..., :3, 3] + matvec(hand_poses[..., :3, :3], self._middles)
+
+    def low_points(
+        self,
+        pos: Tensor,
+        rot: Tensor,
+        middles: Tensor,
+        hand_poses: Tensor,
+        rows: Tensor,
+        below: float,
+    ) -> LowPoints:
         """Find the lowest point of each carrier's shapes, where it is lower above the table than ``below`` [m].
 
         Args:
             pos: [B, C, 3] carriers' origins.
             rot: [B, C, 3, 3] their orientations.
-            hand_poses: [B, G, 4, 4] see :meth:`hand_poses`.
+            middles: [S, G, 3] see :meth:`middles`.
+            hand_poses: [S, G, 4, 4] see :meth:`hand_poses`.
+            rows: [B] row of ``middles`` and ``hand_poses`` of each element of the batch.
             below: largest height above the table [m].
         """
-        hand_rot = hand_poses[..., :3, :3]
-        hand_pos = hand_poses[..., :3, 3]
-        middle = hand_pos + matvec(hand_rot, self._middles)  # [B, G, 3]
-        height = pos[:, self._carrier, 2] + (rot[:, self._carrier, 2] * middle).sum(-1)
+        up = rot[:, :, 2].index_select(1, self._carrier)
+        height = pos[:, :, 2].index_select(1, self._carrier) + (up * middles[rows]).sum(-1)
         frame, link = (height - self._reach < below).nonzero(as_tuple=True)
+        if not len(frame):
+            return LowPoints(frame=frame, carrier=link, height=pos[:0, 0, 2], point=pos[:0, 0])
         position, point = members(self._first[link], self._count[link])
         row = frame[position]
         own = link[position]
         carrier = self._carrier[own]
-        local = hand_pos[row, own] + matvec(hand_rot[row, own], self._points[point])
-        lever = matvec(rot[row, carrier], local)
-        heights = height_above_table(lever + pos[row, carrier], self._radii[point], self.table)
-        low = LowPoints(frame=row, carrier=carrier, height=heights, lever=lever)[heights < below]
+        T = hand_poses[rows[frame], link][position]
+        local = T[:, :3, 3] + matvec(T[:, :3, :3], self._points[point])
+        centers = matvec(rot[row, carrier], local) + pos[row, carrier]
+        heights = height_above_table(centers, self._radii[point], self.table)
+        low = LowPoints(frame=row, carrier=carrier, height=heights, point=centers)[heights < below]
         low = low[low.height.argsort(stable=True)]
         key = low.frame * len(self.carriers) + low.carrier
         order = key.argsort(stable=True)
@@ -177,10 +193,13 @@ class ArmModel:
         self, targets: ArmTargets, thresholds: Thresholds, config: ArmSearch | None = None
     ) -> ArmProblem:
         """Return the search for a path, with the limits of a valid frame."""
+        hand_poses = self.hand_poses(targets.hand_joints)
         return ArmProblem(
             **vars(targets),
             model=self,
-            hand_poses=self.hand_poses(targets.hand_joints),
+            root_rot=quat_to_matrix(targets.root_quat),
+            hand_poses=hand_poses,
+            middles=self.middles(hand_poses),
             thresholds=thresholds,
             config=config or ArmSearch(),
         )
@@ -197,8 +216,13 @@ class ArmModel:
 class ArmProblem(ArmTargets):
     """Targets, and everything else that the search for a path needs. An index selects sequences, or frames of them."""
 
+    # computed once from the targets
+    root_rot: Tensor
+    """[S, T, 3, 3] orientation of the hand root."""
     hand_poses: Tensor
-    """[S, T, G, 4, 4] see :meth:`ArmModel.hand_poses`; computed once from the targets."""
+    """[S, T, G, 4, 4] see :meth:`ArmModel.hand_poses`."""
+    middles: Tensor
+    """[S, T, G, 3] see :meth:`ArmModel.middles`."""
     model: ArmModel
     thresholds: Thresholds
     config: ArmSearch
@@ -214,7 +238,12 @@ class ArmProblem(ArmTargets):
         poses = model.kinematics.link_poses(model.full(joints, self.hand_joints).flatten(0, 1))
         carriers = poses[:, [model.kinematics.link_index(link) for link in model.carriers]]
         low = model.low_points(
-            carriers[..., :3, 3], carriers[..., :3, :3], self.hand_poses.flatten(0, 1), _SEARCH
+            carriers[..., :3, 3],
+            carriers[..., :3, :3],
+            self.middles.flatten(0, 1),
+            self.hand_poses.flatten(0, 1),
+            torch.arange(len(carriers)),
+            _SEARCH,
         )
         height = poses.new_full((len(poses),), _SEARCH).scatter_reduce(
             0, low.frame, low.height, "amin"

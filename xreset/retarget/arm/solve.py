@@ -25,12 +25,7 @@ import torch
 from torch import Tensor
 
 from xreset.files.processes import in_processes
-from xreset.geometry.rotations import (
-    matrix_to_quat,
-    quat_conjugate,
-    quat_multiply,
-    quat_to_axis_angle,
-)
+from xreset.geometry.rotations import matrix_to_axis_angle, matrix_to_quat
 from xreset.physics.tensors import Tensors, one_thread
 from xreset.retarget.arm.config import ArmSearch
 from xreset.retarget.arm.model import ArmModel, ArmProblem, ArmTargets, arm_jump
@@ -154,12 +149,12 @@ def _better_paths(problem: ArmProblem, paths: Paths, joints: Tensor, worth: Tens
 
 
 def follow(problem: ArmProblem, start: Tensor) -> Tensor:
-    """[S, T, n] joints along the path. Every frame is solved from the joints of the frame before, the first from
-    ``start`` [S, n]."""
-    config = problem.config
-    path = [solve(problem[:, 0], start, config.first_iterations)]
+    """[S, T, n] joints along the path from a solution ``start`` [S, n] of the first frame. Every other frame is solved
+    from the joints of the frame before."""
+    path = [start]
     for t in range(1, problem.annotated.shape[1]):
-        path.append(solve(problem[:, t], path[-1], config.iterations, previous=path[-1]))
+        iterations = problem.config.iterations
+        path.append(solve(problem[:, t], path[-1], iterations, previous=path[-1]))
     return torch.stack(path, dim=1)
 
 
@@ -273,7 +268,7 @@ def _first_frame_solutions(problem: ArmProblem) -> Tensor:
     start = _random_starts(problem.model, config)
     frame = problem[:, :1].repeated(config.restarts)[:, 0]
     solved = solve(frame, start.repeat(sequences, 1), config.first_iterations)
-    cost = system(frame, solved).cost
+    cost = system(frame, solved, torch.arange(len(solved))).cost
     shape = (sequences, config.restarts)
     solved = solved.unflatten(0, shape)
     order = (cost.view(shape) + _HOME_BIAS * (solved - home).square().sum(-1)).argsort(dim=1)
@@ -391,9 +386,7 @@ def solve(
     model = frame.model
 
     def evaluate(q: Tensor, rows: Tensor) -> Quadratic:
-        if len(rows) == len(start):
-            return system(frame, q, previous)
-        return system(frame[rows], q, None if previous is None else previous[rows])
+        return system(frame, q, rows, previous)
 
     def step(q: Tensor, here: Quadratic, damping: Tensor) -> Tensor:
         free = free_to_move(q, here.gradient, model.lower, model.upper)
@@ -407,34 +400,44 @@ def solve(
     return minimize(start, evaluate, step, done, iterations, damping_range=(1e-9, 1e9))
 
 
-def system(frame: ArmProblem, q: Tensor, previous: Tensor | None = None) -> Quadratic:
-    """Compute the cost of one frame and its Gauss-Newton approximation at ``q`` [B, n]; arguments as of
-    :func:`solve`."""
+def system(frame: ArmProblem, q: Tensor, rows: Tensor, previous: Tensor | None = None) -> Quadratic:
+    """Compute the cost of one frame and its Gauss-Newton approximation at ``q`` [R, n], for the rows [R] of the batch;
+    other arguments as of :func:`solve`."""
     model = frame.model
     config = frame.config
-    origins, rot, linear, angular = model.kinematics.jacobian(model.full(q, 0.0), model.carriers)
-    linear = linear[..., model.arm]  # [B, C, 3, n]
-    angular = angular[..., model.arm]
+    base = model.kinematics.base
+    links = model.kinematics.twists(model.full(q, 0.0), model.carriers, base.expand(len(q), 4, 4))
+    coupling = links.coupling[:, model.arm]
     position_scale = config.position_weight**0.5
     orientation_scale = config.orientation_weight**0.5
-    rotation_error = quat_to_axis_angle(
-        quat_multiply(matrix_to_quat(rot[:, 0]), quat_conjugate(frame.root_quat))
+    linear, angular = links.twists.split(3, dim=1)  # [R, 3, m]
+    origin = links.pos[:, 0]
+    at_origin = linear + torch.linalg.cross(angular, (origin - base[:3, 3])[..., None], dim=1)
+    moves = torch.cat((position_scale * at_origin, orientation_scale * angular), dim=1)
+    turn = links.rot[:, 0] @ frame.root_rot[rows].mT
+    off = (
+        position_scale * (origin - frame.root_pos[rows]),
+        orientation_scale * matrix_to_axis_angle(turn),
     )
-    residuals = [
-        position_scale * (origins[:, 0] - frame.root_pos),
-        orientation_scale * rotation_error,
-    ]
-    jacobians = [position_scale * linear[:, 0], orientation_scale * angular[:, 0]]
-    low = model.low_points(origins, rot, frame.hand_poses, config.table_margin)
-    at = (low.frame, low.carrier)
-    lift = linear[at] + torch.linalg.cross(angular[at], low.lever[..., None], dim=1)
-    scale = config.collision_weight**0.5
-    value = scale * (config.table_margin - low.height)
-    residuals.append(q.new_zeros(linear.shape[:2]).index_put(at, value))
-    jacobians.append(q.new_zeros(linear[:, :, 0].shape).index_put(at, -scale * lift[:, 2]))
-    found = Quadratic.of_residuals(torch.cat(residuals, dim=1), torch.cat(jacobians, dim=1))
-    if previous is None:
-        return found
-    smoothness = q.new_full(q.shape[1:], config.smoothness_weight)
-    change = change_cost(q - previous, smoothness, config.jump_limit, config.jump_weight)
-    return found + replace(change, curvature=torch.diag_embed(change.curvature))
+    jacobian = (moves * links.carried[0]) @ coupling
+    found = Quadratic.of_residuals(torch.cat(off, dim=1), jacobian)
+    low = model.low_points(
+        links.pos, links.rot, frame.middles, frame.hand_poses, rows, config.table_margin
+    )
+    if len(low.frame):
+        scale = config.collision_weight**0.5
+        x, y, _ = (low.point - base[:3, 3])[..., None].unbind(1)
+        twist = links.twists[low.frame]
+        rises = twist[:, 2] + twist[:, 3] * y - twist[:, 4] * x  # of the point
+        slope = -scale * (rises * links.carried[low.carrier]) @ coupling
+        value = scale * (config.table_margin - low.height)
+        found.cost.index_add_(0, low.frame, value.square())
+        found.gradient.index_add_(0, low.frame, value[:, None] * slope)
+        found.curvature.index_add_(0, low.frame, slope[:, :, None] * slope[:, None])
+    if previous is not None:
+        smoothness = q.new_full(q.shape[1:], config.smoothness_weight)
+        change = change_cost(q - previous[rows], smoothness, config.jump_limit, config.jump_weight)
+        found.cost.add_(change.cost)
+        found.gradient.add_(change.gradient)
+        found.curvature.diagonal(dim1=-2, dim2=-1).add_(change.curvature)
+    return found

@@ -6,6 +6,7 @@ links with support points.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Self
 
 import torch
@@ -232,7 +233,10 @@ class ArmProblem(ArmTargets):
         return self[torch.arange(len(self.hand_poses)).repeat_interleave(count)]
 
     def measures(self, joints: Tensor) -> Measures:
-        """Measure every frame [S, T] of the paths ``joints`` [S, T, n]."""
+        """Measure every frame [S, T] of the paths ``joints`` [S, T, n].
+
+        In frames that are invalid for another reason than a jump, ``self_clearance`` is the hand's own.
+        """
         model = self.model
         shape = joints.shape[:2]
         poses = model.kinematics.link_poses(model.full(joints, self.hand_joints).flatten(0, 1))
@@ -248,10 +252,9 @@ class ArmProblem(ArmTargets):
         height = poses.new_full((len(poses),), _SEARCH).scatter_reduce(
             0, low.frame, low.height, "amin"
         )
-        clearance = torch.as_tensor(model.arm_collision.clearance(poses.numpy())).view(shape)
         root = carriers[:, 0]
         at_limit = (joints <= model.lower + _AT_LIMIT) | (joints >= model.upper - _AT_LIMIT)
-        return Measures(
+        no_jumps = Measures(
             annotated=self.annotated,
             hand_error=self.hand_error,
             wrist_position=(root[:, :3, 3].view(*shape, 3) - self.root_pos).norm(dim=-1),
@@ -259,9 +262,18 @@ class ArmProblem(ArmTargets):
                 matrix_to_quat(root[:, :3, :3]).view(*shape, 4), self.root_quat
             ),
             at_limit=at_limit.any(-1),
-            arm_jump=arm_jump(joints, self.annotated),
+            arm_jump=poses.new_zeros(shape),
             table_clearance=height.view(shape),
-            self_clearance=torch.minimum(clearance, self.hand_clearance),
+            self_clearance=self.hand_clearance,
+        )
+        rows = (classify(no_jumps, self.thresholds) == 0).flatten()
+        clearance = self.hand_clearance.flatten().clone()
+        of_arm = torch.as_tensor(model.arm_collision.clearance(poses[rows].numpy()))
+        clearance[rows] = torch.minimum(clearance[rows], of_arm)
+        return replace(
+            no_jumps,
+            arm_jump=arm_jump(joints, self.annotated),
+            self_clearance=clearance.view(shape),
         )
 
     def reasons(self, joints: Tensor) -> Tensor:

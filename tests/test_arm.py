@@ -65,11 +65,18 @@ class PlaceTest(InFolder):
         self.assertEqual(placing.reach(self.lost, self.wrists), (0.0, 0.0))
 
     def test_a_pose_that_is_missed_is_not_solved_again(self):
-        """Other paths and frames of a sequence may help; a frame alone has the same solutions again."""
-        with patch("xreset.retarget.arm.solve.solve", wraps=solve) as solved:
-            _, measures = track(ArmModel(self.lost), self.wrists[:2], Thresholds())
+        """Other paths and frames of a sequence may help; a frame alone has the same solutions again. Its distances
+        between the robot's shapes would not matter."""
+        model = ArmModel(self.lost)
+        clearance = model.arm_collision.clearance
+        with (
+            patch("xreset.retarget.arm.solve.solve", wraps=solve) as solved,
+            patch.object(model.arm_collision, "clearance", wraps=clearance) as measured,
+        ):
+            _, measures = track(model, self.wrists[:2], Thresholds())
         self.assertTrue(classify(measures, Thresholds()).all())
         solved.assert_called_once()
+        self.assertFalse([call for call in measured.call_args_list if len(call.args[0])])
 
     def test_a_robot_in_a_wrong_place_is_moved_to_where_it_reaches(self):
         seen = []

@@ -235,6 +235,12 @@ class TransferTest(TestCase):
         self.assertEqual((none.num_states, len(calls)), (3, 1))
         self.assertFalse(none.transferred.any())
 
+    def test_hardly_more_grasps_are_tried_than_a_pose_lacks(self):
+        data = motion(first=(0.0, 0.03, 0.04, 0.05, 0.06, 0.07, 0.08))
+        found, calls = tried(bank(data, (PRESSING,) * 7), data, per_pose=3)
+        self.assertEqual([len(names) for _, _, names, *_ in calls], [15])  # 18 candidates
+        self.assertEqual(found.frame_index[7:].tolist(), [1] * 3 + [2] * 3 + [3] * 3)
+
     def test_what_the_arm_does_not_reach_is_not_tried(self):
         pos = self.data.object_pos.copy()
         pos[5] += [0, 1, 0]

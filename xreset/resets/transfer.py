@@ -53,6 +53,8 @@ _POSES = 4
 goal."""
 _CANDIDATES = 40
 """Most grasps that are tried at each pose."""
+_SPARE = 2
+"""Candidates that are tried at a time at each pose, beyond the states that it lacks: some do not hold."""
 _SEED = 0
 """Seed of the grasps that are drawn."""
 _BATCH = 512
@@ -100,16 +102,18 @@ def add_transfers(
     rows = [np.zeros(0, dtype=int)]
     states = []
     depths = []
-    at_once = 2 * config.per_pose
-    work = len(pose) * (1 + len(bank.engines))
-    for first in range(0, _CANDIDATES, at_once):
-        found = np.bincount(pose[np.concatenate(rows)], minlength=len(poses))
-        is_next = (place >= first) & (place < first + at_once)
-        tried = np.flatnonzero(is_next & (found[pose] < config.per_pose))
+    each = 1 + len(bank.engines)
+    work = len(pose) * each
+    until = np.zeros(len(poses), dtype=int)  # candidates of each pose that have been tried
+    before = 0
+    while True:
+        missing = config.per_pose - np.bincount(pose[np.concatenate(rows)], minlength=len(poses))
+        more = np.where(missing > 0, missing + _SPARE, 0)
+        tried = np.flatnonzero((place >= until[pose]) & (place < (until + more)[pose]))
         if not len(tried):
             break
-        before = work * float(np.mean(place < first))
-        share = work * float(np.mean(is_next))
+        until += more
+        share = len(tried) * each
         holding, held, depth = _holding(
             bank,
             grasp[tried],
@@ -120,6 +124,7 @@ def add_transfers(
             device=device,
             progress=lambda part, before=before, share=share: progress(before + share * part, work),
         )
+        before += share
         rows.append(tried[held])
         states.append(holding)
         depths.append(depth)

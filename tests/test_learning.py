@@ -472,9 +472,32 @@ class ConfigTest(TestCase):
                 "changes observation_latency, which is 0",
             ),
             (PushConfig, {"probability": (0.0, 0.1)}, "expected two numbers above 0"),
+            (PushConfig, {"probability": (0.1, 0.2, 0.3)}, "expected two numbers above 0"),
+            (PpoConfig, {"horizon": 16.0}, "horizon is 16.0, expected a whole number above 1"),
+            (PpoConfig, {"learning_rate": True}, "learning_rate is True, expected a number"),
+            (ModelConfig, {"lstm": None}, "lstm is None, expected a whole number above 0"),
+            (ModelConfig, {"mlp": (64.5,)}, "mlp is .64.5,., expected one width or more"),
+            (TaskConfig, {"joint_slots": (7,)}, "joint_slots is .7,., expected two whole numbers"),
+            (TaskConfig, {"joint_slots": (7, 0)}, "joint_slots is .*, expected two whole numbers"),
+            (
+                RandomizationConfig,
+                {"friction": (0.5,)},
+                "friction is .0.5,., expected two finite numbers",
+            ),
+            (
+                ObservationConfig,
+                {"policy": {"object_pos": {"noise": np.float32(0.1)}}},
+                "expected terms: name -> parameter -> finite number or word",
+            ),
         ):
             with refuses(self, problem, ValueError):
                 make(**options)
+
+    def test_values_are_kept_as_files_hold_them(self):
+        """A run is continued if its configuration equals the one in run.json."""
+        given = RandomizationConfig(friction=[0.5, 1.0], metal=np.float32(0.5))
+        found = from_dict(RandomizationConfig, json.loads(json.dumps(asdict(given))))
+        self.assertEqual(found, given)
 
     def test_removed_options_are_ignored_where_they_were_off(self):
         """Files of earlier versions hold them."""

@@ -22,7 +22,7 @@ from xreset.files.text import shown
 
 Point = Annotated[
     tuple[float, float, float],
-    Rule("three finite numbers", lambda p: len(p) == 3 and all(map(math.isfinite, p))),
+    Rule("three finite numbers", lambda p: all(map(math.isfinite, p))),
 ]
 Pixels = Annotated[int, Rule("a number from 8 to 1024", lambda n: 8 <= n <= 1024)]
 

@@ -149,24 +149,30 @@ Number = Annotated[float, Rule("a finite number of at most 1e9", lambda x: abs(x
 
 
 class Checked:
-    """Base of dataclasses whose fields are checked: making one with a value that breaks its field's rule, with an
-    unknown word, or with something else in place of a truth or a dataclass raises ``WrongValueError``, which names
-    every such field."""
+    """Base of dataclasses whose fields are checked: making one with a value that breaks its field's rule, or is of
+    another type, raises ``WrongValueError``, which names every such field."""
 
     def __post_init__(self) -> None:
         wrong = []
-        for name, marks in marks_of(type(self)).items():
-            value = getattr(self, name)
-            wrong += [
-                f"{name} is {shown(value)}, expected {rule.expected}"
-                for rule in _broken_rules(marks, value)
-            ]
-        for name, hint in _choices_of(type(self)).items():
-            value = getattr(self, name)
-            if not _is_of(hint, value):
-                wrong.append(f"{name} is {shown(value)}, expected {_described(hint)}")
+        for name, hint in _hints_of(type(self)).items():
+            value = _plain(getattr(self, name))
+            object.__setattr__(self, name, value)
+            marks = marks_of(type(self))[name]
+            broken = _broken_rules(marks, value)
+            expected = [rule.expected for rule in broken]
+            if not broken and not _is_of(hint, value):
+                expected = [mark.expected for mark in marks if isinstance(mark, Rule)]
+                expected = expected or [_described(hint)]
+            wrong += [f"{name} is {shown(value)}, expected {each}" for each in expected]
         if wrong:
             raise WrongValueError("; ".join(wrong))
+
+
+def _plain(value: Any) -> Any:
+    """Return a value as it comes back from a file: a number of Python, not of numpy, and a tuple, not a list."""
+    if isinstance(value, np.generic):
+        return value.item()
+    return tuple(value) if isinstance(value, list) else value
 
 
 class Options:
@@ -189,28 +195,32 @@ def marks_in(hint: Any) -> list[Any]:
 
 
 @cache
-def _choices_of(cls: type) -> dict[str, Any]:
-    """Field name -> type, of the fields that take a truth, one of a few words or an object of a dataclass."""
-    choices = {}
-    for name, hint in get_type_hints(cls).items():
-        for part in _parts(hint):
-            item = get_args(part)[0] if get_origin(part) is tuple else part
-            if item is bool or get_origin(item) is Literal or is_dataclass(item):
-                choices[name] = hint
-    return choices
+def _hints_of(cls: type) -> dict[str, Any]:
+    """Field name -> type."""
+    hints = get_type_hints(cls)
+    return {f.name: hints[f.name] for f in fields(cast(Any, cls))}
 
 
 def _described(hint: Any) -> str:
-    """Return what messages call a type of :func:`_choices_of`."""
-    if hint is bool:
-        return "True or False"
+    """Return what messages call a type."""
+    if hint in _NAMES:
+        return _NAMES[hint]
     if get_origin(hint) is Literal:
         return f"one of {', '.join(map(repr, get_args(hint)))}"
     if _is_union(hint):
         return " or ".join(map(_described, get_args(hint)))
     if get_origin(hint) is tuple:
         return f"several of: {_described(get_args(hint)[0])}"
-    return "None" if hint is types.NoneType else hint.__name__
+    return (get_origin(hint) or hint).__name__
+
+
+_NAMES = {
+    bool: "True or False",
+    int: "a whole number",
+    float: "a number",
+    str: "a text",
+    types.NoneType: "None",
+}
 
 
 def _broken_rules(marks: Iterable[Any], value: Any) -> list[Rule]:
@@ -222,7 +232,7 @@ def _broken_rules(marks: Iterable[Any], value: Any) -> list[Rule]:
 def _holds(rule: Rule, value: Any) -> bool:
     try:
         return bool(rule.holds(value))
-    except (TypeError, ValueError, OverflowError):  # of another type, or an integer of 400 digits
+    except (TypeError, ValueError, IndexError, OverflowError):  # or an integer of 400 digits
         return False
 
 
@@ -291,16 +301,26 @@ def _hint_of(function: Callable[..., Any], name: str) -> Any:
 
 
 def _is_of(hint: Any, value: Any) -> bool:
-    """Return whether a value and the items of a tuple are of a type of :func:`_choices_of`."""
+    """Return whether a value and the items of a tuple are of a type."""
     if _is_union(hint):
         return any(_is_of(part, value) for part in get_args(hint))
     kind = get_origin(hint) or hint
+    if kind is Any:
+        return True
     if kind is Literal:
         return value in get_args(hint)
     if kind is tuple:
-        is_list = isinstance(value, tuple | list)
-        return is_list and all(_is_of(get_args(hint)[0], item) for item in value)
-    return isinstance(value, (bool, np.bool_) if kind is bool else kind)
+        if not isinstance(value, tuple):
+            return False
+        kinds = get_args(hint)
+        if kinds[-1] is Ellipsis:
+            kinds = kinds[:1] * len(value)
+        return len(kinds) == len(value) and all(map(_is_of, kinds, value))
+    if kind in (int, float) and isinstance(value, bool):
+        return False
+    if kind is float:
+        return isinstance(value, int | float)
+    return isinstance(value, dict if issubclass(kind, dict) else kind)
 
 
 # Reading from JSON and TOML -------------------------------------------------------------------------------------------

@@ -54,7 +54,7 @@ class ModelConfig(Checked):
 class PpoConfig(Checked):
     """Proximal policy optimization."""
 
-    horizon: Annotated[int, Rule("a number above 1", lambda steps: steps > 1)] = 16
+    horizon: Annotated[int, Rule("a whole number above 1", lambda steps: steps > 1)] = 16
     """Control steps per world and iteration. Not 1: rsl-rl stores LSTM states from a run's second step on."""
     sequence_length: PositiveInt = 4
     """Length of truncated back-propagation through time; divides the horizon."""

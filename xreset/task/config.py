@@ -8,7 +8,6 @@ from __future__ import annotations
 from copy import deepcopy
 from dataclasses import field, replace
 from math import isfinite
-from numbers import Real
 from typing import Annotated, Any, Literal
 
 from xreset.cameras.config import VisionConfig
@@ -430,7 +429,9 @@ class TaskConfig(Checked):
     file's axes have no effect either."""
     distance_points: PositiveInt = 256
     """Surface points per object for fingertip distances."""
-    joint_slots: tuple[PositiveInt, PositiveInt] | None = None
+    joint_slots: (
+        Annotated[tuple[int, int], Rule("two whole numbers above 0", lambda x: min(x) > 0)] | None
+    ) = None
     """Slots of a policy for several robots: for joints of the arm, and of each of the five fingers
     (``xreset/task/slots.py``). None: the policy has the joints of its robot, in their order."""
 
@@ -456,8 +457,7 @@ class TaskConfig(Checked):
     def __post_init__(self) -> None:
         super().__post_init__()
         seconds = self.termination.episode_seconds
-        is_number = isinstance(seconds, Real) and not isinstance(seconds, bool)
-        if not is_number or not (1 - 1e-6) * self.control_dt <= seconds <= LONGEST_EPISODE:
+        if not (1 - 1e-6) * self.control_dt <= seconds <= LONGEST_EPISODE:
             raise WrongValueError(
                 f"episode_seconds is {shown(seconds)}, expected a number from {self.control_dt:.3g}, which is one "
                 f"control step, to {LONGEST_EPISODE:,.0f}"

@@ -33,7 +33,7 @@ def _are_terms(terms: Any) -> bool:
 
 
 def _is_value(value: Any) -> bool:
-    return isinstance(value, str) or isfinite(value)
+    return isinstance(value, str) or (isinstance(value, int | float) and isfinite(value))
 
 
 _FORM = "name -> parameter -> finite number or word"

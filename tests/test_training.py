@@ -313,12 +313,25 @@ class TrainingTest(WithBank):
         other = self.folder / "other_bank.npz"
         write_bank(other, toy_bank(self.robot))
         slower = replace(ONE, ppo=replace(ONE.ppo, learning_rate=1e-5))
+        observed = dict(ONE.task.observation.policy)
+        del observed["goal_pos"]
+        blind = replace(ONE.task, observation=replace(ONE.task.observation, policy=observed))
+        terms = ONE.task.reward.terms | {"points": {"weight": 4.0, "zero": 0.5}}
+        paid = replace(ONE.task, reward=replace(ONE.task.reward, terms=terms))
         for changes, problem in (
             ({"seed": 4}, "seed is 3 there and 4 here"),
             ({"num_envs": 5}, "num_envs is 4 there and 5 here"),
             ({"bank": other}, "hash of the reset bank is"),
             ({"weights": self.out}, "hash of the weights is None there"),
             ({"config": slower}, "ppo.learning_rate is .* there and 1e-05 here"),
+            (
+                {"config": replace(ONE, task=blind)},
+                "task.observation.policy.goal_pos is {} there and None here",
+            ),
+            (
+                {"config": replace(ONE, task=paid)},
+                "task.reward.terms.points is None there and {'weight': 4.0",
+            ),
         ):
             message = f"job-again holds another training: {problem}.*Choose another folder, or .*xreset train --out"
             with refuses(self, message, RunError, problem):

@@ -30,7 +30,7 @@ from xreset.files.records import read_meta
 from xreset.files.storage import file_hash
 from xreset.files.text import shown
 from xreset.learning.config import TrainConfig
-from xreset.learning.run import checkpoints, flat, read_run, training_left
+from xreset.learning.run import checkpoints, differences, flat, read_run, training_left
 from xreset.task.terms import Terms
 
 XRESET = (sys.executable, "-P", "-m", "xreset")
@@ -183,14 +183,11 @@ def _refuse_other(problem: str, what: str, found: dict[str, Any], wanted: dict[s
     Raises:
         RunError: an entry differs; the message names it.
     """
-    old = dict(flat(found))
-    new = dict(flat(wanted))
-    for name in sorted({*old, *new}):
-        if old.get(name) != new.get(name):
-            raise RunError(
-                f"{problem}: {name} is {shown(old.get(name))} there and {shown(new.get(name))} in the study. "
-                f"Nothing was changed; give the {what} another name, or choose another --out."
-            )
+    for name, there, here in differences(found, wanted):
+        raise RunError(
+            f"{problem}: {name} is {shown(there)} there and {shown(here)} in the study. Nothing was changed; give the "
+            f"{what} another name, or choose another --out."
+        )
 
 
 # What is left to do ---------------------------------------------------------------------------------------------------

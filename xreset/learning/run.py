@@ -152,6 +152,20 @@ def flat(data: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
             yield prefix + name, value
 
 
+def differences(
+    before: dict[str, Any], now: dict[str, Any], prefix: str = ""
+) -> Iterator[tuple[str, Any, Any]]:
+    """Yield the entries that differ between nested dictionaries: names, joined by dots, and both values; None: there is
+    none."""
+    for name in before | now:
+        there = before.get(name)
+        here = now.get(name)
+        if isinstance(there, dict) and isinstance(here, dict):
+            yield from differences(there, here, f"{prefix}{name}.")
+        elif there != here:
+            yield f"{prefix}{name}", there, here
+
+
 def checkpoints(folder: Path) -> list[Path]:
     """Return the checkpoints, oldest first."""
     return sorted((folder / "checkpoints").glob("[0-9]*.pt"))

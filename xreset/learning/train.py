@@ -35,7 +35,7 @@ from xreset.learning.run import (
     TEACHER,
     RunInfo,
     checkpoints,
-    flat,
+    differences,
     latest_checkpoint,
     read_run,
     training_left,
@@ -109,17 +109,16 @@ def refuse_another_training(
     """Refuse to continue the run in a folder as a training that it is not. Its length may differ."""
     before = _identity(present, file_hash(out / TEACHER) if present.teacher else None)
     now = _identity(wanted, teacher.hash if teacher else None)
-    for name, value in before.items():
-        if now.get(name) != value:
-            raise RunError(
-                f"{out} holds another training: {name} is {shown(value)} there and {shown(now.get(name))} here. Choose "
-                f"another folder, or continue it as it was started: xreset train --out {out}"
-            )
+    for name, there, here in differences(before, now):
+        raise RunError(
+            f"{out} holds another training: {name} is {shown(there)} there and {shown(here)} here. Choose another "
+            f"folder, or continue it as it was started: xreset train --out {out}"
+        )
 
 
 def _identity(info: RunInfo, teacher: str | None) -> dict[str, Any]:
     """Return what makes a training the same one, by name; ``teacher`` is the hash of its teacher's policy."""
-    config = dict(flat(asdict(info.config)))
+    config = asdict(info.config)
     del config["iterations"], config["save_interval"]
     return {
         "robot": str(Path(info.robot).resolve()) if Path(info.robot).is_dir() else info.robot,

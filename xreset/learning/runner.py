@@ -233,18 +233,21 @@ class TrainingRunner:
         return obs
 
     def _check_finite(self, obs: TensorDict) -> None:
-        """Refuse observations that are not finite, once per iteration: they come from worlds whose health was sound."""
+        """Refuse a rollout with numbers that are not finite, of which networks would learn nothing else, given its last
+        observations. They come from worlds whose health was sound."""
+        storage = self.alg.storage
+        numbers = [*storage.observations.items(), *obs.items(), ("reward", storage.rewards)]
+        are_finite = torch.stack([value.isfinite().all() for _, value in numbers]).tolist()
+        if all(are_finite):
+            return
+        wrong = {name: None for (name, _), ok in zip(numbers, are_finite, strict=True) if not ok}
         if own := ", ".join(self.env.task.reward.own):
-            remedy = (
-                f"The critic observes the reward: do your own terms return finite numbers ({own})?"
-            )
+            remedy = f"Do your own reward terms return finite numbers ({own})?"
         else:
             remedy = f"Continue from the last checkpoint: {self._resume_command}"
-        for group, value in obs.items():
-            if not value.isfinite().all():
-                raise RunError(
-                    f"The observation group {group!r} is not finite at iteration {self.iteration}. {remedy}"
-                )
+        raise RunError(
+            f"Numbers are not finite at iteration {self.iteration}: {', '.join(wrong)}. {remedy}"
+        )
 
     def _check_faults(self, steps: int) -> None:
         """End the run if too many worlds broke. Every process comes to the same result.

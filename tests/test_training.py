@@ -588,6 +588,13 @@ class TrainingTest(WithBank):
         self.assertEqual(content.actor_state_dict[count], before.actor_state_dict[count])
         self.assertEqual(content.critic_state_dict[count], seen + 8 * 4)
 
+    def test_a_run_that_is_stopped_before_it_learns_has_the_policy_that_it_began_with(self):
+        config = replace(CONFIG, ppo=replace(CONFIG.ppo, average=0.5))
+        with patch.object(TrainingRunner, "_agreed", return_value=True):
+            out = self.train("at-once", config=config, weights=self.out)
+        given = newest(self.out).policy_state_dict
+        assert_close(newest(out).policy_state_dict, given, rtol=0, atol=0)
+
     def test_a_policy_that_ships_learns_on_from_its_checkpoint(self):
         self.enterContext(patch("xreset.policy.shipped.FOLDER", self.folder))
         shutil.copy(self.out / "policy.onnx", self.folder / "skilled.onnx")

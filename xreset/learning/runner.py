@@ -296,8 +296,6 @@ class TrainingRunner:
             load_moments(self.alg.optimizer, content.optimizer_state_dict["state"])
             if content.resets_state_dict:
                 self.env.resets.success_rate.copy_(content.resets_state_dict["success_rate"])
-            for name, mean in self._average.items():
-                mean.copy_(content.policy_state_dict[name])
         self.alg.learning_rate = content.learning_rate
         self.iteration = content.iteration
         self.env_steps = content.env_steps
@@ -318,6 +316,8 @@ class TrainingRunner:
         with must_fit(path):
             for name, network in self.alg.networks.items():
                 network.load_state_dict(getattr(content, f"{name}_state_dict"))
+            for name, mean in self._average.items():
+                mean.copy_(content.policy_state_dict[name])
         return content
 
 

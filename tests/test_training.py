@@ -722,8 +722,27 @@ class TrainingTest(WithBank):
         observation = replace(CONFIG.task.observation, perception=cloud)
         short = replace(CONFIG, task=replace(CONFIG.task, observation=observation))
         wide = replace(CONFIG, model=replace(CONFIG.model, lstm=16))
-        empty = toy_bank(self.robot).with_states(np.zeros(6, dtype=bool))
+        bank = toy_bank(self.robot)
+        empty = bank.with_states(np.zeros(6, dtype=bool))
+
+        def with_task(**changes):
+            return replace(CONFIG, task=replace(CONFIG.task, **changes))
+
+        flat = replace(observation, perception={"object_pos": {"noise": 0.0}})
+        double = replace(observation, policy=observation.policy | cloud)
+        before_contact = replace(CONFIG.task.reset, pre_contact_only=True)
+        touching = bank.with_states(bank.post_contact)
         for words, options in (
+            (
+                "has 7 joints in its arm .* slots for 5 and 1",
+                {"config": with_task(joint_slots=(5, 1))},
+            ),
+            ("perception has 'object_pos'. Surface", {"config": with_task(observation=flat)}),
+            ("policy has 'cloud'. Surface points", {"config": with_task(observation=double)}),
+            (
+                "no state before contact",
+                {"config": with_task(reset=before_contact), "bank": touching},
+            ),
             ("is not a run folder", {"weights": self.folder, "goals": toy_goals(self.robot)}),
             ("another observation layout", {"weights": self.out, "config": short}),
             (r"{'lstm': 12}, .*{'lstm': 16}.*--recipe", {"weights": self.out, "config": wide}),
@@ -750,7 +769,8 @@ class TrainingTest(WithBank):
             ("no state to reset to.*demo-probability 0", {"bank": empty}),
             ("reset bank for the robot 'openarm'", {"robot": "ur7e-sharpa"}),
         ):
-            with refuses(self, words, XResetError):
+            started = patch("xreset.learning.train.make_env", side_effect=AssertionError)
+            with refuses(self, words, XResetError), started:
                 self.train("refused", **options)
             self.assertEqual(list(self.folder.glob("refused/*.npz")), [], words)
         with patch.dict("sys.modules", {"wandb": None}), refuses(self, r"\[wandb\]", XResetError):

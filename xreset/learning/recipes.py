@@ -173,14 +173,11 @@ def for_robots(config: TrainConfig, robots: Sequence[RobotSpec]) -> TrainConfig:
     describe the robot. A configuration that has slots stays as it is.
 
     Raises:
-        RobotError: a robot does not fit into slots.
+        RobotError: a robot does not fit into any slots.
     """
-    from xreset.task.slots import check_fits, needed_slots
+    from xreset.task.slots import needed_slots
 
-    slots = config.task.joint_slots
-    if slots is not None:
-        for robot in robots:
-            check_fits(robot, slots)
+    if config.task.joint_slots is not None:
         return config
     observation = config.task.observation
     proprio = observation.proprio | {"joint_mask": {}, "joint_pos_limits": {}, "tip_mask": {}}

@@ -50,6 +50,7 @@ from xreset.resets.goals import GoalSet, read_goals, with_goals, write_goals
 from xreset.resets.inputs import Inputs, load_inputs
 from xreset.spec import RobotSpec
 from xreset.task.rewards import RewardFunction
+from xreset.task.slots import Slots
 
 
 def default_device(engine: str) -> str:
@@ -226,18 +227,24 @@ def bank_or_goals(
 
 
 def check_config(config: TrainConfig, inputs: Inputs, *, has_teacher: bool) -> None:
-    """Refuse, with ``XResetError``, bank states where there are none, unknown terms of the reward, and a student
-    without cameras."""
+    """Refuse, with ``XResetError``, bank states where there are none, unknown terms of the reward, a robot that does
+    not fit into slots, and a student without cameras."""
     if has_teacher and not config.task.vision.cameras:
         raise XResetError(
             "A student needs a camera. Give one or two of: " + ", ".join(CAMERAS) + "."
         )
     check_each_once(config.task.vision.cameras)
     RewardFunction(config.task.reward)
-    if config.task.reset.demo_probability > 0 and not inputs.bank.num_states:
+    Slots.of(inputs.robot, config.task.joint_slots)
+    reset = config.task.reset
+    bank = inputs.bank
+    if reset.pre_contact_only:
+        bank = bank.with_states(~bank.post_contact)
+    if reset.demo_probability > 0 and not bank.num_states:
+        before = " before contact" if reset.pre_contact_only else ""
         raise RunError(
-            f"There is no state to reset to in {inputs.name}: every candidate was rejected. Look at its reasons "
-            "(xreset resets), or train without it: --config.task.reset.demo-probability 0"
+            f"There is no state{before} to reset to in {inputs.name}: every candidate was rejected. Look at its "
+            "reasons (xreset resets), or train without it: --config.task.reset.demo-probability 0"
         )
 
 

@@ -463,7 +463,8 @@ class TaskConfig(Checked):
                 f"control step, to {LONGEST_EPISODE:,.0f}"
             )
         steps = seconds / self.control_dt
-        for name in ("action_latency", "hand_latency", "observation_latency", "proprio_latency"):
+        delays = ("action_latency", "hand_latency", "observation_latency", "proprio_latency")
+        for name in (*delays, "camera_latency"):
             longest = self.randomization.longest(name)
             if longest >= steps:
                 raise WrongValueError(

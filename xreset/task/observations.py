@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from xreset.cameras.config import VisionConfig
+from xreset.errors import WrongValueError
 from xreset.files.checks import NonNegativeFloat, PositiveFloat, PositiveInt, frozen
 from xreset.geometry.rotations import (
     quat_conjugate,
@@ -424,18 +425,23 @@ def layout(
     values. With cameras the groups are ``goal``, ``proprio`` and ``view``.
 
     Raises:
-        WrongValueError: as for :class:`Observer`.
+        WrongValueError: as for :class:`Observer`, or surface points are not in ``perception``, or something else is.
     """
     observer = Observer(c)
     x = _example(num_joints, num_tips, c.cloud_points)
-
-    def widths(group: str) -> dict[str, int]:
-        return {name: value[0].numel() for name, value in observer.terms(group, x).items()}
-
+    widths: dict[str, dict[str, int]] = {}
+    for group in GROUPS:
+        widths[group] = {}
+        for name, value in observer.terms(group, x).items():
+            if (value.dim() == 4) != (group == "perception"):
+                raise WrongValueError(
+                    f"task.observation.{group} has {name!r}. Surface points, and nothing else, belong into perception."
+                )
+            widths[group][name] = value[0].numel()
     if vision is None or not vision.cameras:
-        return {group: widths(group) for group in ("policy", "proprio", "perception")}
+        return {group: widths[group] for group in ("policy", "proprio", "perception")}
     view = {"points": prod(vision.view_shape)}
-    return {"goal": widths("goal"), "proprio": widths("proprio"), "view": view}
+    return {"goal": widths["goal"], "proprio": widths["proprio"], "view": view}
 
 
 def cloud_shape(c: ObservationConfig) -> tuple[int, ...]:

@@ -57,11 +57,6 @@ class SeveralEnvs:
             env.resets.success_rate = part
 
     @property
-    def cfg(self) -> Any:
-        """The task, as rsl-rl calls it."""
-        return self.task
-
-    @property
     def episode_length_buf(self) -> Tensor:
         """[N] control steps since each world's reset. Assigned values are copied."""
         return torch.cat([env.episode_length_buf for env in self.envs])

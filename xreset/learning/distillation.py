@@ -78,7 +78,6 @@ class SequenceDistillation(Distillation):
     def update(self) -> dict[str, float]:
         """Learn from the rollout; return the mean squared error of the student's actions."""
         storage = self.storage
-        memory = self.student.get_hidden_state()
         total = torch.zeros((), device=self.device)
         for _ in range(self.num_learning_epochs):
             order = torch.randperm(storage.num_envs, device=self.device)
@@ -101,6 +100,5 @@ class SequenceDistillation(Distillation):
                 self.optimizer.step()
                 total += loss.detach()
         self.student.update_normalization(storage.observations.flatten(0, 1))
-        self.student.reset(hidden_state=memory)
         storage.clear()
         return {"behavior": float(total) / (self.num_learning_epochs * self.num_mini_batches)}

@@ -285,12 +285,15 @@ class LaunchTest(Studied):
             self.step("c", "exit 3"),
             self.step("d", "touch done", "c"),
             self.step("e", "touch done"),
+            self.step("f", "exit 3", "c"),
         ]
+        (self.folder / "f").mkdir()
+        (self.folder / "f" / "done").touch()
         plan = Mock(spec=Plan, steps={s.name: s for s in steps})
         said: list[str] = []
         problems = launch(plan, steps, said.append)
         self.assertEqual(problems, ["c: to do", "d cannot start: c is not done."])
-        self.assertEqual([step.left() for step in steps], ["", "", "to do", "to do", ""])
+        self.assertEqual([step.left() for step in steps], ["", "", "to do", "to do", "", ""])
         self.assertEqual(len(said), 4)
 
     def test_a_step_imports_nothing_from_the_current_folder(self):

@@ -15,7 +15,7 @@ def launch(plan: Plan, steps: Sequence[Step], say: Callable[[str], None] = print
 
     Args:
         plan: plan of the study.
-        steps: steps to run.
+        steps: steps to run, unless they are done.
         say: called with a line before each command.
 
     Returns:
@@ -23,6 +23,8 @@ def launch(plan: Plan, steps: Sequence[Step], say: Callable[[str], None] = print
     """
     problems = []
     for step in steps:
+        if not step.left():
+            continue
         undone = [need for need in step.needs if plan.steps[need].left()]
         if undone:
             problems.append(f"{step.name} cannot start: {', '.join(undone)} is not done.")

@@ -535,12 +535,12 @@ class TypedTest(TestCase):
                 good | {"inner": {"size": 1.0, "mode": "c"}},
             ),
             ("pair has 3 entries, expected 2", good | {"pair": [1.0, 2.0, 3.0]}),
-            ("on is 1, expected bool", good | {"on": 1}),
-            (r"widths\[0\] is True, expected int", good | {"widths": [True]}),
-            (r"widths\[1\] is 2.5, expected int", good | {"widths": [1, 2.5]}),
+            ("on is 1, expected True or False", good | {"on": 1}),
+            (r"widths\[0\] is True, expected a whole number", good | {"widths": [True]}),
+            (r"widths\[1\] is 2.5, expected a whole number", good | {"widths": [1, 2.5]}),
             ("configuration is 3, expected an object", 3),
             (
-                r"widths\[0\] is a number of thousands of digits, expected int",
+                r"widths\[0\] is a number of thousands of digits, expected a whole number",
                 good | {"widths": [2**15000]},
             ),
             (

@@ -1314,7 +1314,7 @@ class ObservationTest(TestCase):
                 {"noise": 0.1},
                 r"policy\.joint_vel does not fit joint_vel .missing: scale",
             ),
-            ("tip_force", {"scale": "x"}, r"policy\.tip_force\.scale is 'x', expected float"),
+            ("tip_force", {"scale": "x"}, r"policy\.tip_force\.scale is 'x', expected a number"),
         ):
             with refuses(self, words, ValueError):
                 self.value(**{name: parameters})

@@ -744,9 +744,11 @@ class TrainingTest(WithBank):
                 {"config": with_task(reset=before_contact), "bank": touching},
             ),
             ("is not a run folder", {"weights": self.folder, "goals": toy_goals(self.robot)}),
-            ("another observation layout", {"weights": self.out, "config": short}),
             (r"{'lstm': 12}, .*{'lstm': 16}.*--recipe", {"weights": self.out, "config": wide}),
-            (r"layout .*--recipe .*run$", {"weights": self.out, "config": short}),
+            (
+                r"another observation layout .*--recipe .*run$",
+                {"weights": self.out, "config": short},
+            ),
             ("policy of the robot 'ur7e-sharpa', not of 'openarm'", {"weights": "many-objects"}),
             ("sees through cameras", {"weights": "many-objects-camera", "config": None}),
             (

@@ -312,15 +312,19 @@ def _is_of(hint: Any, value: Any) -> bool:
     if kind is tuple:
         if not isinstance(value, tuple):
             return False
-        kinds = get_args(hint)
-        if kinds[-1] is Ellipsis:
-            kinds = kinds[:1] * len(value)
+        kinds = _item_kinds(hint, len(value))
         return len(kinds) == len(value) and all(map(_is_of, kinds, value))
     if kind in (int, float) and isinstance(value, bool):
         return False
     if kind is float:
         return isinstance(value, int | float)
     return isinstance(value, dict if issubclass(kind, dict) else kind)
+
+
+def _item_kinds(hint: Any, count: int) -> tuple[Any, ...]:
+    """Return the types of the items of a tuple; ``count`` of them if it may have any number."""
+    kinds = get_args(hint)
+    return kinds[:1] * count if kinds[-1] is Ellipsis else kinds
 
 
 # Reading from JSON and TOML -------------------------------------------------------------------------------------------
@@ -527,9 +531,7 @@ def _parsed_value(hint: Any, value: Any, where: str, problems: list[str]) -> Any
     if origin is tuple:
         if not isinstance(value, list | tuple):
             return wrong("a list")
-        kinds = arguments
-        if arguments[-1] is Ellipsis:
-            kinds = arguments[:1] * len(value)
+        kinds = _item_kinds(hint, len(value))
         if len(kinds) != len(value):
             problems.append(f"{where} has {len(value)} entries, expected {len(kinds)}.")
             return None
@@ -549,9 +551,7 @@ def _parsed_value(hint: Any, value: Any, where: str, problems: list[str]) -> Any
         return value
     if issubclass(hint, dict):
         return hint(value) if isinstance(value, dict) else wrong("an object")
-    kinds = (int, float) if hint is float else hint
-    is_bool = hint is not bool and isinstance(value, bool)
     is_large = isinstance(value, int) and abs(value) > _LARGEST
-    if not isinstance(value, kinds) or is_bool or is_large:
-        return wrong(hint.__name__)
+    if not _is_of(hint, value) or is_large:
+        return wrong(_described(hint))
     return float(value) if hint is float else value

@@ -321,11 +321,13 @@ def write_result(
         columns, allow_nan=False
     )  # refuses a number that is not finite before anything is written
     trace = folder / f"{name}.trace.npz"
+    path = folder / f"{name}.json"
+    path.unlink(missing_ok=True)  # a kill leaves no earlier results next to new states
     if traces:
         write_traces(trace, traces, joint_names)
     else:
         trace.unlink(missing_ok=True)
-    write_json(folder / f"{name}.json", content)
+    write_json(path, content)
     (folder / f"{name}.episodes.json").unlink(missing_ok=True)  # of an earlier version
 
 

@@ -422,6 +422,12 @@ class ResultsTest(InFolder):
         for expected in ("mujoco", "sapien", "49.8%", "episodes: 4, demonstrations: 2, seed: 3"):
             self.assertIn(expected, str(evaluation))
 
+    def test_a_kill_leaves_no_earlier_results_next_to_new_states(self):
+        killed = patch("xreset.eval.results.write_json", side_effect=KeyboardInterrupt)
+        with killed, self.assertRaises(KeyboardInterrupt):
+            write_result(self.folder, toy_result(), self.rollouts.traces, JOINTS)
+        self.assertEqual([result.engine for result in read_evaluation(self.folder)], ["sapien"])
+
     def test_means_and_intervals(self):
         found = toy_result()
         self.assertEqual((found.objects, found.episodes_per_demo), ((SOUP, SPAM), 2))

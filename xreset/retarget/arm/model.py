@@ -177,13 +177,16 @@ class ArmModel:
         local = T[:, :3, 3] + matvec(T[:, :3, :3], self._points[point])
         centers = matvec(rot[row, carrier], local) + pos[row, carrier]
         heights = height_above_table(centers, self._radii[point], self.table)
-        low = LowPoints(frame=row, carrier=carrier, height=heights, point=centers)[heights < below]
-        low = low[low.height.argsort(stable=True)]
-        key = low.frame * len(self.carriers) + low.carrier
+        low = (heights < below).nonzero()[:, 0]
+        low = low[heights[low].argsort(stable=True)]
+        key = row[low] * len(self.carriers) + carrier[low]
         order = key.argsort(stable=True)
         is_first = torch.ones_like(order, dtype=torch.bool)
         is_first[1:] = key[order].diff() != 0
-        return low[order[is_first]]
+        low = low[order[is_first]]
+        return LowPoints(
+            frame=row[low], carrier=carrier[low], height=heights[low], point=centers[low]
+        )
 
     def hand_clearance(self, hand_joints: Tensor) -> Tensor:
         """[...] smallest signed distance between the hand's shapes that can collide in physics, at most 0 [m]."""

@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 
 from tests.toy_bank import ONLY_FRAMES, SOUP, SPAM, in_this_process, shifted, toy_retargeted
 from xreset import FilterConfig, SqueezeConfig, robots
-from xreset.errors import DemoError
+from xreset.errors import DemoError, XResetError
 from xreset.geometry.kinematics import Kinematics
 from xreset.objects.catalogue import load_objects
 from xreset.objects.rest import rest_height
@@ -219,3 +219,5 @@ class FilterTest(TestCase):
             make_bank(none, self.robot, self.objects, ["mujoco"])
         with self.assertRaisesRegex(DemoError, "objects that were not given"):
             make_bank(self.retargeted(), self.robot, self.objects[:0], ["mujoco"])
+        with self.assertRaisesRegex(XResetError, "No engine is named. Name one or several"):
+            make_bank(self.retargeted(), self.robot, self.objects, [])  # would accept all states

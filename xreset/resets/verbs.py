@@ -12,6 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+from xreset.errors import XResetError
 from xreset.files.checks import Option, OutputFile, PositiveInt, Seed, obeys_rules
 from xreset.files.progress import NamedProgress, Progress, unseen
 from xreset.files.records import replaces
@@ -75,7 +76,7 @@ def make_bank(
     Raises:
         DemoError: no frame is valid, or an object of a valid frame is unknown.
         FileFormatError: the motion is for a robot with other joints.
-        XResetError: coal, which retargeting needs too, is not installed.
+        XResetError: no engine is named, or coal, which retargeting needs too, is not installed.
     """
     from xreset.files.records import stated_doubts
     from xreset.resets.bank import write_bank
@@ -92,6 +93,8 @@ def make_bank(
     motion = inputs.motion()
     scene = (inputs.robot, inputs.objects)
     engines = (engine,) if isinstance(engine, str) else tuple(dict.fromkeys(engine))
+    if not engines:
+        raise XResetError("No engine is named. Name one or several of them.")
     limits = limits or FilterConfig()
     closing = closing or ClosingConfig(spacing=None)
     squeeze = squeeze or SqueezeConfig(force=0.0)

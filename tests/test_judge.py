@@ -10,10 +10,12 @@ from PIL import Image
 from tests import toy_grasp
 from tests.command import refused, succeeds
 from tests.data import InFolder
+from tests.toy_bank import shifted
 from tests.toy_grasp import OPEN, brick, robot
 from xreset import SqueezeConfig, load_robot, write_bank
 from xreset.errors import DemoError, RobotError
 from xreset.geometry.kinematics import Kinematics
+from xreset.geometry.shapes import turn_of
 from xreset.robot_tools import judge as judging
 from xreset.robot_tools.verbs import judge
 
@@ -41,6 +43,24 @@ class Judge(InFolder):
         self.assertEqual(reached, [(name, 0, {"no grasp": 3}) for name in ("brick", "all")])
         rise = np.diff(found.shots["brick"][:, -5])  # of the object's z
         self.assertGreater(rise[1], 0.08)
+
+    def test_the_origin_of_a_mesh_may_be_anywhere(self):
+        """This one moves by centimeters where the brick turns a little in the hand."""
+        shift = np.array([0, 40.0, 40.0])
+        poses = bank()
+        moved = {}
+        for pos, quat in (
+            ("object_pos", poses.object_quat_wxyz),
+            ("start_pos", poses.start_quat_wxyz),
+            ("goal_pos", poses.goal_quat_wxyz),
+        ):
+            place = getattr(poses, pos) - turn_of(quat).apply(shift)
+            moved[pos] = place.astype(np.float32)
+        squeeze = SqueezeConfig(force=4.0)
+        brick_row, _ = judge(
+            replace(poses, **moved), robot(), (shifted(brick(), shift),), squeeze=squeeze
+        ).rows
+        self.assertEqual((brick_row.tried, brick_row.hold, brick_row.lift), (3, 3, 3))
 
     def test_prospects_are_states_that_turn_times_demonstrations_in_reach(self):
         def row(engine, name, turn):

@@ -38,19 +38,19 @@ from xreset.resets.bank import ResetBank
 from xreset.resets.config import SqueezeConfig
 from xreset.resets.fingers import Fingers, fingers_of, squeeze_targets
 from xreset.resets.grasps import losses, raised
-from xreset.resets.probe import probe
+from xreset.resets.probe import of_center, probe
 from xreset.resets.programs import palm_path
 from xreset.spec import ObjectSpec, RobotSpec, SceneSpec, objects_named
 
 PHASES = ("hold", "lift", "turn")
 LIFT = 0.01
-"""Height of the object's origin above the demonstration's start from which a state is lifted [m]."""
+"""Height of the center of mass above the demonstration's start from which a state is lifted [m]."""
 HEIGHT = 0.10
 """How far the arm raises the hand [m]."""
 TURN = np.pi / 4
 """How far the arm turns the hand [rad]."""
 DISTANCE = 0.03
-"""Largest change of the object's position in the palm's frame [m]."""
+"""Largest change of the center of mass in the palm's frame [m]."""
 ANGLE = np.pi / 4
 """Largest change of the object's orientation in the palm's frame [rad]."""
 _REACH = 0.010
@@ -274,7 +274,7 @@ def _play(kinematics: Kinematics, backend: Backend, start: State) -> Tensor:
     """Go through the phases; return [N, 1 + P + P (J + 7)]: whether the arm can raise and turn the hand, which phases
     are passed, then the joints and the object's pose after each phase."""
     backend.set_object_gravity(torch.ones(backend.num_worlds, device=backend.device))
-    start = start.to("cpu").map(Tensor.double)
+    start = of_center(backend, start).to("cpu").map(Tensor.double)
     joints = start.joint_pos
     palm = kinematics.link_poses(joints, [kinematics.robot.palm])[:, 0]
     up, up_error = arm_path(kinematics, joints, palm, turn=0.0)
@@ -292,7 +292,8 @@ def _play(kinematics: Kinematics, backend: Backend, start: State) -> Tensor:
     shots = []
     for path, error in ((still, torch.zeros_like(up_error)), (up, up_error), (turn, turn_error)):
         _move(backend, start.joint_target, path, kinematics.robot.arm_indices)
-        now = backend.state().to("cpu").map(Tensor.double)
+        state = backend.state()
+        now = of_center(backend, state).to("cpu").map(Tensor.double)
         links = backend.links().to("cpu").map(Tensor.double)
         now_pos, now_quat = relative_pose(
             now.object_pos, now.object_quat, links.pos[:, 0], links.quat[:, 0]
@@ -300,7 +301,7 @@ def _play(kinematics: Kinematics, backend: Backend, start: State) -> Tensor:
         near = ((now_pos - pos).norm(dim=-1) < DISTANCE) & (quat_angle(now_quat, quat) < ANGLE)
         kept = kept & near & (error < 1)
         passed.append(kept)
-        shots.append(_shot(now))
+        shots.append(_shot(state.to("cpu").map(Tensor.double)))
     health = backend.health()
     sound = ~(health.nonfinite | health.overflow).cpu()
     return torch.cat((able[:, None], torch.stack(passed, dim=1) & sound[:, None], *shots), dim=1)

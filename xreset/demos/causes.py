@@ -140,9 +140,16 @@ class Recording:
         return _in_frame(self.pos, self.matrix, self.points)
 
     @cached_property
+    def places(self) -> np.ndarray:
+        """[F, 3] the object's center of mass, or its origin if its mesh is unknown [m]."""
+        if self.surface is None:
+            return self.pos
+        return self.pos + self.turn.apply(self.surface.obj.com)
+
+    @cached_property
     def moved(self) -> np.ndarray:
         """[F] bool: whether the object has moved from its start."""
-        return np.linalg.norm(self.pos - self.pos[0], axis=1) > MOVED
+        return np.linalg.norm(self.places - self.places[0], axis=1) > MOVED
 
     @cached_property
     def step_turn(self) -> Rotation:
@@ -247,22 +254,15 @@ class Recording:
         """Length of a step in frames, the frames in which a step begins that moves the object, and the object's
         motion in each of these steps [m]."""
         base = max(1, round(_BASE * self.fps))
-        step = np.linalg.norm(self.pos[base:] - self.pos[:-base], axis=1)
+        step = np.linalg.norm(self.places[base:] - self.places[:-base], axis=1)
         begin = np.flatnonzero(step > _LEAST_STEP)
         return base, begin, step[begin]
-
-    @cached_property
-    def start_place(self) -> np.ndarray:
-        """[3] the object's center of mass in the first frame, or its origin if its mesh is unknown [m]."""
-        if self.surface is None:
-            return self.pos[0]
-        return self.pos[0] + self.turn[0].apply(self.surface.obj.com)
 
     @cached_property
     def off_table(self) -> float:
         """Distance from the object to the table's top in the first frame, from above; 0 above it [m]."""
         table = TableSpec()
-        beyond = np.abs(self.start_place[:2] - table.center) - table.half_size[:2]
+        beyond = np.abs(self.places[0, :2] - table.center) - table.half_size[:2]
         return float(np.linalg.norm(beyond.clip(0.0)))
 
     @cached_property
@@ -362,7 +362,7 @@ def _of_hand(r: Recording) -> Iterator[Contradiction]:
             f"the hand moves past the object at {slip:.1f} times the object's speed", False
         )
     if r.seen.any():
-        ahead = float(r.points[np.argmax(r.seen), 0, 1] - r.start_place[1])
+        ahead = float(r.points[np.argmax(r.seen), 0, 1] - r.places[0, 1])
         if ahead < _BEHIND:
             yield Contradiction(
                 "the hand comes from the -y side, but the person should be at +y", False

@@ -394,7 +394,7 @@ def _tips_problem(points: np.ndarray) -> str:
 def _fixed_point(r: Recording) -> str:
     """Return which part of the hand stays at one point while the object moves; an empty text if none does."""
     points = r.points[r.seen]
-    still = np.ptp(r.pos[r.seen], axis=0).max() < MOVED
+    still = np.ptp(r.places[r.seen], axis=0).max() < MOVED
     if len(points) < 2 or still:
         return ""
     for what, at in (
@@ -489,7 +489,7 @@ def _doubts_of_speed(r: Recording, jumps: np.ndarray) -> Iterator[Finding]:
 def _of_motion(r: Recording) -> Iterator[Finding]:
     """Yield doubts about the object's motion."""
     turn = (r.turn[-1] * r.turn[0].inv()).magnitude()
-    if np.linalg.norm(r.pos[-1] - r.pos[0]) < _SAME_PLACE and turn < _SAME_TURN:
+    if np.linalg.norm(r.places[-1] - r.places[0]) < _SAME_PLACE and turn < _SAME_TURN:
         yield _doubt(
             "goal",
             "It begins with the object at its goal already.",
@@ -505,13 +505,13 @@ def _of_motion(r: Recording) -> Iterator[Finding]:
         )
     if len(r.pos) < 3:
         return
-    speed = r.fps * np.linalg.norm(np.diff(r.pos, axis=0), axis=1)
+    speed = r.fps * np.linalg.norm(np.diff(r.places, axis=0), axis=1)
     angle = r.step_turn.magnitude()
     across = (r.turn[2:] * r.turn[:-2].inv()).magnitude()
     turned = np.minimum(angle[1:], angle[:-1]) - across > _TURN_RETURN
     jumps = np.zeros(len(r.pos), dtype=bool)
     jumps[1:] |= speed > _OBJECT_SPEED
-    jumps[1:-1] |= (_returns(r.pos) > _OBJECT_RETURN) | turned
+    jumps[1:-1] |= (_returns(r.places) > _OBJECT_RETURN) | turned
     if jumps.any():
         yield _doubt(
             "jumps",
@@ -598,7 +598,7 @@ def _doubts_of_tracking(r: Recording) -> Iterator[Finding]:
     if copies := list(_copies("object copies", "its pose", same, _moves(r))):
         yield from copies
         return
-    place = np.linalg.norm(np.diff(r.pos, n=2, axis=0), axis=1) / np.sqrt(6.0)
+    place = np.linalg.norm(np.diff(r.places, n=2, axis=0), axis=1) / np.sqrt(6.0)
     angle = np.linalg.norm(np.diff(r.step_turn.as_rotvec(), axis=0), axis=1) / np.sqrt(6.0)
     trembles = []
     dt = 1.0 / r.fps
@@ -622,7 +622,7 @@ def _doubts_of_tracking(r: Recording) -> Iterator[Finding]:
 
 def _moves(r: Recording) -> np.ndarray:
     """[F-1] bool: whether the object moves around a step of its motion, between the first and the last one."""
-    around = np.pad(r.pos, ((1, 1), (0, 0)), mode="edge")
+    around = np.pad(r.places, ((1, 1), (0, 0)), mode="edge")
     moves = np.linalg.norm(around[3:] - around[:-3], axis=1) * r.fps > 3 * _MOVES
     steps = np.flatnonzero(np.diff(r.pos, axis=0).any(axis=1))
     moves[: steps.min(initial=len(moves))] = moves[steps.max(initial=-1) + 1 :] = False

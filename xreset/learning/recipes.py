@@ -140,7 +140,13 @@ def starting_config(recipe: str) -> TrainConfig:
             f"{flags}.",
             file=sys.stderr,
         )
-    return replace(config, task=replace(config.task, reward=reward.without_own()))
+    return without_own(config)
+
+
+def without_own(config: TrainConfig) -> TrainConfig:
+    """Return a configuration without reward terms of the user's own."""
+    reward = config.task.reward.without_own()
+    return replace(config, task=replace(config.task, reward=reward))
 
 
 def is_policy(name: str) -> bool:

@@ -30,7 +30,7 @@ from xreset.learning.distributed import Processes, leave
 from xreset.learning.export import export_checkpoint
 from xreset.learning.exported import read_policy
 from xreset.learning.from_onnx import layers_of
-from xreset.learning.recipes import is_policy, own_terms_flags, student_config
+from xreset.learning.recipes import is_policy, own_terms_flags, student_config, without_own
 from xreset.learning.run import (
     TEACHER,
     RunInfo,
@@ -88,7 +88,7 @@ def refuse_options(out: Path, given: Mapping[str, Any], config: TrainConfig | No
         raise RunError(
             f"A training needs a reset bank (--resets), a goal set (--goals), or both; {out} holds no run to continue."
         )
-    only_own = config and config.task.reward.own and _without_own(config) == TrainConfig()
+    only_own = config and config.task.reward.own and without_own(config) == TrainConfig()
     if not only_own:
         given = {**given, "config": config}
     for name, value in given.items():
@@ -97,11 +97,6 @@ def refuse_options(out: Path, given: Mapping[str, Any], config: TrainConfig | No
                 f"Without a reset bank or a goal set, {out} continues as it was started. Omit {name}, give the whole "
                 f"command again, or start another run with this run's networks: --weights {out}"
             )
-
-
-def _without_own(config: TrainConfig) -> TrainConfig:
-    reward = config.task.reward.without_own()
-    return replace(config, task=replace(config.task, reward=reward))
 
 
 def refuse_another_training(

@@ -490,17 +490,11 @@ def evaluation_task(task: TaskConfig) -> TaskConfig:
         task,
         observation=task.observation.without_noise(),
         reward=task.reward.without_own(),
-        reset=replace(
-            task.reset,
+        reset=ResetConfig(
             demo_probability=0.0,
             home_gravity_std=0.0,
-            training_xy=None,
-            goal_xy=0.0,
-            goal_z=0.0,
-            goal_yaw=0.0,
-            object_share={},
-            crossed_goals=0.0,
-            adaptive_share=0.0,
+            spawn_xy=task.reset.spawn_xy,
+            spawn_yaw=task.reset.spawn_yaw,
         ),
         randomization=replace(task.randomization, enabled=False),
     )

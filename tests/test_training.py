@@ -730,6 +730,7 @@ class TrainingTest(WithBank):
 
         flat = replace(observation, perception={"object_pos": {"noise": 0.0}})
         double = replace(observation, policy=observation.policy | cloud)
+        nothing = replace(observation, privileged={})
         before_contact = replace(CONFIG.task.reset, pre_contact_only=True)
         touching = bank.with_states(bank.post_contact)
         for words, options in (
@@ -739,6 +740,7 @@ class TrainingTest(WithBank):
             ),
             ("perception has 'object_pos'. Surface", {"config": with_task(observation=flat)}),
             ("policy has 'cloud'. Surface points", {"config": with_task(observation=double)}),
+            ("privileged has no terms", {"config": with_task(observation=nothing)}),
             (
                 "no state before contact",
                 {"config": with_task(reset=before_contact), "bank": touching},

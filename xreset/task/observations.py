@@ -425,20 +425,26 @@ def layout(
     values. With cameras the groups are ``goal``, ``proprio`` and ``view``.
 
     Raises:
-        WrongValueError: as for :class:`Observer`, or surface points are not in ``perception``, or something else is.
+        WrongValueError: as for :class:`Observer`; surface points are not in ``perception``, or something else is; a
+            group has no terms.
     """
     observer = Observer(c)
     x = _example(num_joints, num_tips, c.cloud_points)
+    cameras = None if vision is None else vision.cameras
     widths: dict[str, dict[str, int]] = {}
     for group in GROUPS:
+        if group == "goal" and not cameras:
+            continue
         widths[group] = {}
+        if not getattr(c, group):
+            raise WrongValueError(f"task.observation.{group} has no terms. Add one.")
         for name, value in observer.terms(group, x).items():
             if (value.dim() == 4) != (group == "perception"):
                 raise WrongValueError(
                     f"task.observation.{group} has {name!r}. Surface points, and nothing else, belong into perception."
                 )
             widths[group][name] = value[0].numel()
-    if vision is None or not vision.cameras:
+    if vision is None or not cameras:
         return {group: widths[group] for group in ("policy", "proprio", "perception")}
     view = {"points": prod(vision.view_shape)}
     return {"goal": widths["goal"], "proprio": widths["proprio"], "view": view}

@@ -104,9 +104,8 @@ def minimize(
         better = there.cost < here.cost
         dampings = torch.where(better, dampings * 0.2, dampings * 8.0).clamp(*damping_range)
         left = ~done(now, trial, here.cost, there.cost, dampings)
-        all_better = bool(better.all())
-        now = trial if all_better else where(better, trial, now)
-        here = there if all_better else where(better, there, here)
+        now = where(better, trial, now)
+        here = where(better, there, here)
         best[rows] = now
         if not left.any():
             break

@@ -140,11 +140,6 @@ class ArmModel:
             poses[..., : len(moving), :, :] = self.hand.link_poses(hand_joints, moving)
         return poses
 
-    def middles(self, hand_poses: Tensor) -> Tensor:
-        """[..., G, 3] centers of balls around the support points of each link, in its carrier's frame, at poses
-        [..., G, 4, 4] of :meth:`hand_poses`."""
-        return hand_poses[..., :3, 3] + matvec(hand_poses[..., :3, :3], self._middles)
-
     def low_points(
         self,
         pos: Tensor,
@@ -159,7 +154,7 @@ class ArmModel:
         Args:
             pos: [B, C, 3] carriers' origins.
             rot: [B, C, 3, 3] their orientations.
-            middles: [S, G, 3] see :meth:`middles`.
+            middles: [S, G, 3] see :attr:`ArmProblem.middles`.
             hand_poses: [S, G, 4, 4] see :meth:`hand_poses`.
             rows: [B] row of ``middles`` and ``hand_poses`` of each element of the batch.
             below: largest height above the table [m].
@@ -167,8 +162,6 @@ class ArmModel:
         up = rot[:, :, 2].index_select(1, self._carrier)
         height = pos[:, :, 2].index_select(1, self._carrier) + (up * middles[rows]).sum(-1)
         frame, link = (height - self._reach < below).nonzero(as_tuple=True)
-        if not len(frame):
-            return LowPoints(frame=frame, carrier=link, height=pos[:0, 0, 2], point=pos[:0, 0])
         position, point = members(self._first[link], self._count[link])
         row = frame[position]
         own = link[position]
@@ -203,7 +196,7 @@ class ArmModel:
             model=self,
             root_rot=quat_to_matrix(targets.root_quat),
             hand_poses=hand_poses,
-            middles=self.middles(hand_poses),
+            middles=matvec(hand_poses[..., :3, :3], self._middles) + hand_poses[..., :3, 3],
             thresholds=thresholds,
             config=config or ArmSearch(),
         )
@@ -226,7 +219,7 @@ class ArmProblem(ArmTargets):
     hand_poses: Tensor
     """[S, T, G, 4, 4] see :meth:`ArmModel.hand_poses`."""
     middles: Tensor
-    """[S, T, G, 3] see :meth:`ArmModel.middles`."""
+    """[S, T, G, 3] centers of balls around the support points of each link, in its carrier's frame."""
     model: ArmModel
     thresholds: Thresholds
     config: ArmSearch

@@ -346,7 +346,7 @@ class ResetTest(WithEnv):
         """World 0 ends from home at its goal, world 1 elsewhere, world 2 at its goal from a state of the bank."""
         near = RewardConfig(gate={"near": {"tips": 10.0, "palm": 10.0}})
         reset = replace(TASK.reset, demo_probability=0.0, adaptive_share=0.5)
-        env = self.make(replace(TASK, reward=near, reset=reset))
+        env = self.make(replace(TASK, reward=near, reset=reset), kind=BreakableBackend)
         state = env.backend.state()
         env.goal_pos.copy_(state.object_pos)
         env.goal_quat.copy_(state.object_quat)
@@ -367,6 +367,10 @@ class ResetTest(WithEnv):
         env.goal_pos += 0.3
         env.step(torch.zeros(N, 7))
         self.assertLess(float(env.resets.success_rate.min()), 1.0)
+        env.resets.success_rate.fill_(1.0)
+        env.backend.overflow[:] = True
+        env.step(torch.zeros(N, 7))
+        assert_close(env.resets.success_rate, torch.ones(3), msg="the simulations failed")
 
     def test_starts_come_from_the_distribution_and_may_press(self):
         """Drives begin with the bank's targets; from home they hold the joints."""

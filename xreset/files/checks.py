@@ -189,7 +189,7 @@ def marks_of(cls: type) -> dict[str, list[Any]]:
 def marks_in(hint: Any) -> list[Any]:
     """Return what an annotation holds in addition to the type."""
     marks = []
-    for part in _parts(hint):
+    for part in get_args(hint) if _is_union(hint) else (hint,):
         marks += getattr(part, "__metadata__", ())
     return marks
 
@@ -238,11 +238,6 @@ def _holds(rule: Rule, value: Any) -> bool:
 
 def _is_union(hint: Any) -> bool:
     return get_origin(hint) in (Union, types.UnionType)
-
-
-def _parts(hint: Any) -> tuple[Any, ...]:
-    """Return the members of a union, or the type itself."""
-    return get_args(hint) if _is_union(hint) else (hint,)
 
 
 def first_repeated(values: Sequence[Any]) -> int | None:

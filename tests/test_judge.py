@@ -47,20 +47,15 @@ class Judge(InFolder):
     def test_the_origin_of_a_mesh_may_be_anywhere(self):
         """This one moves by centimeters where the brick turns a little in the hand."""
         shift = np.array([0, 40.0, 40.0])
-        poses = bank()
+        own = bank()
         moved = {}
-        for pos, quat in (
-            ("object_pos", poses.object_quat_wxyz),
-            ("start_pos", poses.start_quat_wxyz),
-            ("goal_pos", poses.goal_quat_wxyz),
-        ):
-            place = getattr(poses, pos) - turn_of(quat).apply(shift)
-            moved[pos] = place.astype(np.float32)
-        squeeze = SqueezeConfig(force=4.0)
-        brick_row, _ = judge(
-            replace(poses, **moved), robot(), (shifted(brick(), shift),), squeeze=squeeze
-        ).rows
-        self.assertEqual((brick_row.tried, brick_row.hold, brick_row.lift), (3, 3, 3))
+        for name in ("object", "start", "goal"):
+            turn = turn_of(getattr(own, f"{name}_quat_wxyz"))
+            place = getattr(own, f"{name}_pos") - turn.apply(shift)
+            moved[f"{name}_pos"] = place.astype(np.float32)
+        far = (replace(own, **moved), robot(), (shifted(brick(), shift),))
+        row, _ = judge(*far, squeeze=SqueezeConfig(force=4.0)).rows
+        self.assertEqual((row.tried, row.hold, row.lift), (3, 3, 3))
 
     def test_prospects_are_states_that_turn_times_demonstrations_in_reach(self):
         def row(engine, name, turn):

@@ -42,9 +42,8 @@ class _Step(NamedTuple):
     """How a link's pose follows from its parent's."""
 
     parent: int
-    moving: int
-    """Row among the moving joints; -1 if fixed."""
-    prismatic: bool
+    joint: str
+    """Type of the joint between them."""
     offset: Tensor
     """[3] origin of the joint in the parent's frame."""
     rotation: Tensor
@@ -207,7 +206,6 @@ class Kinematics:
 
     def _set_steps(self, joints: Sequence[Joint], moving: Sequence[Joint]) -> None:
         """Set the steps from each link to the next, and which joints move which link."""
-        row = {joint.name: i for i, joint in enumerate(moving)}
         self._moving = moving
         self._steps: list[_Step] = []
         self._above = np.eye(len(self.link_names), dtype=bool)
@@ -217,8 +215,7 @@ class Kinematics:
             self._above[i] |= self._above[parent]
             step = _Step(
                 parent=parent,
-                moving=row.get(joint.name, -1),
-                prismatic=joint.type == "prismatic",
+                joint=joint.type,
                 offset=self.array(joint.T_parent_joint[:3, 3]),
                 rotation=self.array(joint.T_parent_joint[:3, :3]),
             )
@@ -472,13 +469,13 @@ class Kinematics:
                 continue
             parent = rotations[step.parent]
             origin = positions[step.parent] + parent @ step.offset
-            if step.moving < 0:
+            if step.joint == "fixed":
                 rotations[i] = parent @ step.rotation
             else:
                 row = len(children)
                 children.append(i)
                 rotations[i] = parent @ turned[row]
-                if step.prismatic:
+                if step.joint == "prismatic":
                     slid = movers.axes[row] * values[row, :, None, None]
                     origin = origin + (rotations[i] @ slid)[..., 0]
             positions[i] = origin

@@ -71,8 +71,8 @@ class _Movers(NamedTuple):
 
     rows: list[int]
     """Rows among the moving joints."""
-    rotations: tuple[Tensor, Tensor, Tensor]
-    """[m, 1, 3, 3] R, R K and R K^2 with R the child's rotation in the parent's frame at position 0, and K the axis'
+    rotations: Tensor
+    """[3, m, 1, 3, 3] R, R K and R K^2 with R the child's rotation in the parent's frame at position 0, and K the axis'
     cross-product matrix, 0 where a joint slides. At an angle a the rotation is R + sin(a) R K + (1 - cos(a)) R K^2
     (Rodrigues' formula)."""
     axes: Tensor
@@ -233,10 +233,9 @@ class Kinematics:
         axes = np.array([joint.axis for joint in joints]).reshape(-1, 3)
         R = np.array([joint.T_parent_joint[:3, :3] for joint in joints]).reshape(-1, 3, 3)
         K = np.cross(np.eye(3), (turns * axes)[:, None])  # K v = axis x v
-        rotations = [self.array(each)[:, None] for each in (R, R @ K, R @ K @ K)]
         return _Movers(
             rows=rows,
-            rotations=(rotations[0], rotations[1], rotations[2]),
+            rotations=self.array(np.stack((R, R @ K, R @ K @ K)))[:, :, None],
             axes=self.array(axes)[..., None],
             carried=self.array(carried[:, rows]),
             turns=self.array(turns),

@@ -112,6 +112,10 @@ class Waiting(TorchDispatchMode):
         return func(*args, **(kwargs or {}))
 
 
+def lifted(x):
+    return x.object_pos[:, 2] - x.start_pos[:, 2]
+
+
 class WithEnv(TestCase):
     robot = toy_robot()
     objects = load_objects((SOUP, SPAM))
@@ -635,9 +639,11 @@ class ObjectFrameTest(WithEnv, InFolder):
 
     def test_the_frame_of_a_mesh_does_not_matter(self):
         live = RECIPES["live"].config.task
+        terms = live.reward.terms | {f"{__name__}:lifted": {"weight": 100.0}}
         task = replace(
             live,
             distance_points=64,
+            reward=replace(live.reward, terms=terms),
             randomization=RandomizationConfig(),
             reset=replace(live.reset, training_xy=0.05, random_gravity=True),
         )
@@ -666,6 +672,10 @@ class FailureTest(WithEnv):
         self.assertEqual((done.tolist(), extras["time_outs"].tolist()), ([1] * N, [0.0, 1.0, 1.0]))
         self.assertAlmostEqual(reward[0], -5.0, delta=0.02)
         self.assertGreater(reward[1:].min(), -0.02)
+        env = self.make(replace(TASK, object_frame="center"))
+        env._center[1, 2] -= 0.5
+        done = env.step(torch.zeros(N, 7))[2]
+        self.assertEqual(done.tolist(), [0, 1, 0], "the task's origin of the object is judged")
 
     def test_a_world_that_fails_ends_teaches_nothing_and_is_counted_once(self):
         """Whether its simulation breaks or its action is not finite; the other worlds go on."""

@@ -26,7 +26,7 @@ from xreset.policy.onnx_policy import METADATA_KEY, VERSION_KEY
 from xreset.policy.shipped import FOLDER, shipped
 
 SMALL = 1024
-"""Pieces of fewer bytes stay in the graph."""
+"""Weights of fewer bytes stay in a graph and in a checkpoint."""
 LARGE = 100_000
 """Weights of more bytes are stored in half precision."""
 
@@ -49,13 +49,14 @@ def halved(content: bytes) -> bytes:
     return model.SerializeToString()
 
 
-def halved_checkpoint(run: Path) -> bytes:
-    """Return the newest checkpoint of a run with what another training starts from, its large weights in half
-    precision."""
+def halved_checkpoint(run: Path, network: bytes) -> bytes:
+    """Return what another training starts from: the policy and the critic of a run's newest checkpoint, large weights
+    in half precision, without those that the policy's file has (its content)."""
     content = read_checkpoint(latest_checkpoint(run))
+    actor = halved_state(content.policy_state_dict)
     content = replace(
         content,
-        actor_state_dict=halved_state(content.actor_state_dict),
+        actor_state_dict=actor,
         critic_state_dict=halved_state(content.critic_state_dict),
         optimizer_state_dict={"state": {}},
         average_state_dict={},
@@ -63,7 +64,9 @@ def halved_checkpoint(run: Path) -> bytes:
     )
     buffer = io.BytesIO()
     torch.save(vars(content), buffer)
-    return buffer.getvalue()
+    return without_weights(
+        buffer.getvalue(), [v.numpy().tobytes() for v in actor.values()], network
+    )
 
 
 def halved_state(state: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
@@ -75,22 +78,32 @@ def halved_state(state: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
     return halved
 
 
-def without_weights(graph: bytes, network: bytes) -> bytes:
-    """Return a graph without the weights that are in its network's file too, as
-    :func:`xreset.policy.shipped.shipped_graphs` describes it."""
+def cut_graph(graph: bytes, network: bytes) -> bytes:
+    """Return a graph without the weights that its policy's file has."""
+    weights = [constant.raw_data for constant in onnx.load_from_string(graph).graph.initializer]
+    return without_weights(graph, weights, network)
+
+
+def without_weights(content: bytes, weights: list[bytes], network: bytes) -> bytes:
+    """Return a file's content without the weights that its policy's file has, for :func:`xreset.policy.shipped.whole`.
+
+    Args:
+        content: the whole content.
+        weights: its arrays, in the order in which they lie in it.
+        network: content of the policy's file.
+    """
     cuts = []
     rest = []
     end = 0
-    for constant in onnx.load_from_string(graph).graph.initializer:
-        weights = constant.raw_data
-        at = graph.find(weights, end)
-        offset = network.find(weights)
-        if len(weights) < SMALL or at < 0 or offset < 0:
+    for array in weights:
+        at = content.find(array, end)
+        offset = network.find(array)
+        if len(array) < SMALL or at < 0 or offset < 0:
             continue
-        rest.append(graph[end:at])
-        cuts.append((sum(map(len, rest)), offset, len(weights)))
-        end = at + len(weights)
-    rest.append(graph[end:])
+        rest.append(content[end:at])
+        cuts.append((sum(map(len, rest)), offset, len(array)))
+        end = at + len(array)
+    rest.append(content[end:])
     return json.dumps(cuts).encode() + b"\n" + b"".join(rest)
 
 
@@ -99,7 +112,7 @@ def main() -> None:
     for argument in sys.argv[1:]:
         name, _, run = argument.partition("=")
         network = halved(load_policy(run).exported())
-        checkpoint = halved_checkpoint(Path(run))
+        checkpoint = halved_checkpoint(Path(run), network)
         (FOLDER / f"{name}.onnx").write_bytes(network)
         (FOLDER / f"{name}.pt").write_bytes(checkpoint)
         made.add(name)
@@ -111,7 +124,7 @@ def main() -> None:
         own = {key: stated[key] for key in (METADATA_KEY, VERSION_KEY) if key in stated}
         # anew: policy.graph would be the one that ships
         graph = deployed_graph(policy.exported(), policy.robot, policy.task)
-        content = without_weights(with_metadata(graph, own), file.read_bytes())
+        content = cut_graph(with_metadata(graph, own), file.read_bytes())
         file.with_suffix(".graph").write_bytes(content)
         print(name)
 

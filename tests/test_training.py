@@ -602,9 +602,12 @@ class TrainingTest(WithBank):
         self.assertEqual(config.task, CONFIG.task)
         options = {"config": config, "weights": "skilled"}
         self.assertRaisesRegex(PolicyError, "skilled holds no critic", self.train, "on", **options)
+        network = self.folder / "skilled.onnx"
         file = self.folder / "skilled.pt"
-        with patch.object(ship_policies, "LARGE", 0):
-            file.write_bytes(ship_policies.halved_checkpoint(self.out))
+        with patch.multiple(ship_policies, LARGE=0, SMALL=256):
+            network.write_bytes(ship_policies.halved(network.read_bytes()))
+            file.write_bytes(ship_policies.halved_checkpoint(self.out, network.read_bytes()))
+        self.assertTrue(file.read_bytes().startswith(b"[["), "the policy has its weights")
         with patch("torch.optim.Adam.step"):  # the networks stay as they are
             content = newest(self.train("on", **options))
         info = read_run(self.folder / "on")
@@ -644,6 +647,10 @@ class TrainingTest(WithBank):
             if each.shape == bias.shape
         ]
         self.assertTrue(any(close))
+        ships = self.folder / "average.pt"
+        ships.write_bytes(ship_policies.halved_checkpoint(out, network=b""))
+        begins = read_checkpoint(ships).actor_state_dict
+        assert_close(begins, expected, rtol=1e-3, atol=1e-4, check_dtype=False)
 
     def test_a_run_without_a_mean_can_go_on_with_one(self):
         out = self.train("later")

@@ -15,6 +15,7 @@ from xreset.errors import FileFormatError, RunError
 from xreset.files.checks import NonNegativeFloat, NonNegativeInt, Rule, from_dict, frozen
 from xreset.files.storage import atomic_write, must_exist
 from xreset.files.text import shown
+from xreset.policy.shipped import whole
 
 
 def _are_tensors(values: Any) -> bool:
@@ -86,7 +87,7 @@ def read_checkpoint(path: Path, device: str | torch.device = "cpu") -> Checkpoin
     """
     must_exist(path, "checkpoint")
     try:
-        content = torch.load(path, map_location=device, weights_only=True)
+        content = torch.load(io.BytesIO(whole(path)), map_location=device, weights_only=True)
     except torch.OutOfMemoryError:
         raise
     except Exception as error:  # torch's own message advises to load without care

@@ -1,5 +1,6 @@
 """Trained policies that ship with xreset: ``NAME.onnx`` in this folder, the card ``NAME.toml``, and the deployed graph
-without its weights, ``NAME.graph``. With a checkpoint, ``NAME.pt``, a policy can learn on: it holds actor and critic.
+without its weights, ``NAME.graph``. With a checkpoint, ``NAME.pt``, a policy can learn on: it holds actor and critic,
+without the weights that the policy's file has.
 
 The command line knows such a policy as NAME. The name of a robot means the policy of the same name, or the one whose
 card states the robot as ``default_of``.
@@ -17,6 +18,8 @@ from xreset.physics.plugins import robot_names
 FOLDER = Path(__file__).parent
 """Folder of the policies and their cards."""
 SCHEMA = "xreset-policy-card/1"
+CUT = b"["
+"""How a file begins out of which weights were cut."""
 
 
 @frozen
@@ -72,11 +75,7 @@ def no_policy_for(robot: str) -> str:
 
 
 def shipped_graphs() -> dict[str, Path]:
-    """Name -> file with the deployed graph (``docs/live.md``) of every such policy without cameras.
-
-    ``ci/ship_policies.py`` writes these files. The weights are cut out of a graph, because the policy's own file has
-    them. A line of JSON lists the cuts: where in the rest a piece was, and its offset and length in the policy's file.
-    The rest follows."""
+    """Name -> file with the deployed graph (``docs/live.md``) of every such policy without cameras."""
     return {file.stem: file for file in sorted(FOLDER.glob("*.graph"))}
 
 
@@ -87,16 +86,29 @@ def shipped_checkpoints() -> dict[str, Path]:
 
 def graph_of(network: bytes) -> bytes | None:
     """Return the deployed graph of an exported policy's content; None if it does not ship with xreset."""
-    for name, file in shipped_graphs().items():
-        if (FOLDER / f"{name}.onnx").read_bytes() == network:
-            cuts, _, rest = file.read_bytes().partition(b"\n")
-            pieces = []
-            end = 0
-            for at, offset, length in json.loads(cuts):
-                pieces += [rest[end:at], network[offset : offset + length]]
-                end = at
-            return b"".join([*pieces, rest[end:]])
+    for file in shipped_graphs().values():
+        if file.with_suffix(".onnx").read_bytes() == network:
+            return whole(file)
     return None
+
+
+def whole(file: Path) -> bytes:
+    """Return a file's content with the weights that were cut out of it because its policy's file has them.
+
+    ``ci/ship_policies.py`` writes such files next to ``NAME.onnx``. A line of JSON lists the cuts: where in the rest a
+    piece was, and its offset and length in the policy's file. The rest follows. Other files are returned as they are.
+    """
+    content = file.read_bytes()
+    if not content.startswith(CUT):
+        return content
+    network = file.with_suffix(".onnx").read_bytes()
+    cuts, _, rest = content.partition(b"\n")
+    pieces = []
+    end = 0
+    for at, offset, length in json.loads(cuts):
+        pieces += [rest[end:at], network[offset : offset + length]]
+        end = at
+    return b"".join([*pieces, rest[end:]])
 
 
 def card(file: Path) -> Card:

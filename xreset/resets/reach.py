@@ -13,7 +13,6 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from xreset.geometry.rotations import homogeneous
-from xreset.physics.tensors import one_thread
 from xreset.retarget.arm.config import QUICK
 from xreset.retarget.arm.model import ArmModel
 from xreset.retarget.arm.solve import reach_poses
@@ -62,7 +61,6 @@ class Reach:
         or not it can hold anything there."""
         return np.linalg.norm(places - self._base, axis=1) <= self._stretch
 
-    @one_thread()
     def holds(self, start: np.ndarray, goal: np.ndarray, turn: Rotation) -> np.ndarray:
         """[N] bool: whether one of the grasps can be reached both at the start and at the goal.
 

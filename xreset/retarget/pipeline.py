@@ -356,9 +356,7 @@ def _hand_motion(
     robot: RobotSpec, device: str, weights: HandWeights, targets: HandTargets
 ) -> HandState:
     """Return the hand's motion; a function of a module, for other processes."""
-    model = HandModel(robot, device=device)
-    with one_thread():
-        return retarget_hand(model, targets, weights)
+    return retarget_hand(HandModel(robot, device=device), targets, weights)
 
 
 def _arm_targets(

@@ -55,6 +55,7 @@ class Paths(Tensors):
     """[S, K, T] bool: whether a frame is valid if the joints do not jump there."""
 
 
+@one_thread()
 def track(
     model: ArmModel, targets: ArmTargets, thresholds: Thresholds, config: ArmSearch | None = None
 ) -> tuple[Tensor, Measures]:
@@ -115,7 +116,6 @@ def track_each(
     yield from in_processes(partial(_track, robot, thresholds, config), paths)
 
 
-@one_thread()
 def _track(
     robot: RobotSpec, thresholds: Thresholds, config: ArmSearch, path: ArmTargets
 ) -> tuple[Tensor, Measures]:

@@ -22,6 +22,7 @@ from xreset.geometry.rotations import (
     quat_multiply,
     quat_normalize,
 )
+from xreset.physics.tensors import one_thread
 from xreset.retarget.hand.config import HandWeights
 from xreset.retarget.hand.cost import HandSystem, system
 from xreset.retarget.hand.model import HandModel, HandState, HandTargets
@@ -37,6 +38,7 @@ _FIRST_DAMPING = 1.0
 1e-3 on, half of all steps are."""
 
 
+@one_thread()
 def retarget_hand(
     model: HandModel,
     targets: HandTargets,

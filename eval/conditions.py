@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from xreset.errors import XResetError
 from xreset.files.checks import frozen
+from xreset.files.text import texts
 from xreset.task.config import RandomizationConfig, TaskConfig
 
 if TYPE_CHECKING:  # a command checks names of properties before it loads torch
@@ -133,7 +134,7 @@ def chosen_properties(
         XResetError: a property is unknown, or a value is impossible.
     """
     found: dict[str, Property] = {}
-    for text in (wanted,) if isinstance(wanted, str) else wanted:
+    for text in texts(wanted):
         name, equals, values = text.partition("=")
         name = name.replace("_", "-")
         if name not in _BY_OPTION:

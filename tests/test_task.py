@@ -874,7 +874,7 @@ class ResetTest(TestCase):
 
     def test_share_of_bank_resets(self):
         for p in (0.0, 0.25, 0.5, 1.0):
-            share = self.sample(demo_probability=p).from_bank.float().mean()
+            share = (self.sample(demo_probability=p).state >= 0).float().mean()
             self.assertAlmostEqual(share, p, delta=0.03 * (0 < p < 1))
 
     def test_bank_resets_are_states_of_the_bank(self):
@@ -906,7 +906,7 @@ class ResetTest(TestCase):
             with self.subTest(objects=objects, index=index, options=list(options)):
                 many = torch.full((200,), index)
                 reset = self.sample(many, objects, demo_probability=1.0, **options)
-                drawn = ((reset.object_pos[reset.from_bank, 0] - 0.6) * 100).round().int()
+                drawn = ((reset.object_pos[reset.state >= 0, 0] - 0.6) * 100).round().int()
                 self.assertEqual(set(drawn.tolist()), states)
                 self.assertEqual(set(reset.sequence.tolist()), sequences)
         with self.assertRaisesRegex(
@@ -920,7 +920,7 @@ class ResetTest(TestCase):
         bank = self.bank.with_states(np.arange(6) != 1)
         for share in (0.0, 0.5):
             reset = self.sample(bank=bank, demo_probability=0.5, adaptive_share=share)
-            of_bank = reset[reset.from_bank]
+            of_bank = reset[reset.state >= 0]
             first = (1 - share) / 3 + share / 2
             second = (1 - share) / 3 + share / 4
             states = ((of_bank.object_pos[:, 0] - 0.6) * 100).round()
@@ -929,7 +929,7 @@ class ResetTest(TestCase):
                 with self.subTest(share=share, state=state):
                     self.assertAlmostEqual(own.float().mean(), expected, delta=0.03)
                     self.assertAlmostEqual(of_bank.gravity_fraction[own].mean(), 0.5, delta=0.05)
-            of_second = (reset.sequence[~reset.from_bank] == 2).float().mean()
+            of_second = (reset.sequence[reset.state < 0] == 2).float().mean()
             self.assertAlmostEqual(of_second, 0.5, delta=0.03)
 
     def test_demonstrations_that_fail_are_drawn_more_often(self):
@@ -946,7 +946,7 @@ class ResetTest(TestCase):
                     self.assertAlmostEqual(of_second, expected, delta=0.02)
                     self.assertEqual(set(reset.sequence.tolist()), {0, 2})
                     assert_close(reset.goal_pos, self.of(reset, "goal_pos"))
-                    self.assertEqual(reset.from_bank.all(), p == 1.0)
+                    self.assertEqual((reset.state >= 0).all(), p == 1.0)
 
     def test_crossed_goals_have_the_place_lift_and_turn_of_another_demonstration(self):
         """The soup can's demonstrations are 0 and 2; a goal of either is drawn for each of them, from home and bank."""
@@ -981,7 +981,7 @@ class ResetTest(TestCase):
     def test_a_demonstration_without_states_is_drawn_at_home_only(self):
         bank = self.bank.with_states(self.bank.sequence_index != 2)
         reset = self.sample(bank=bank, demo_probability=1.0, adaptive_share=1.0)
-        self.assertTrue(reset.from_bank.all())
+        self.assertTrue((reset.state >= 0).all())
         self.assertEqual(set(reset.sequence.tolist()), {0})
 
     def test_rate_of_success_is_that_of_the_last_episodes(self):
@@ -1043,7 +1043,7 @@ class ResetTest(TestCase):
         options = {"goal_xy": 0.03, "goal_z": 0.05, "goal_yaw": 0.5}
         reset = self.sample(demo_probability=0.5, **options)
         moved = (reset.goal_pos != self.of(reset, "goal_pos")).all(dim=1)
-        self.assertTrue(torch.equal(moved, ~reset.from_bank))
+        self.assertTrue(torch.equal(moved, reset.state < 0))
         task = evaluation_task(TaskConfig(reset=ResetConfig(training_xy=0.1, **options)))
         self.assertEqual(task.reset, evaluation_task(TaskConfig()).reset)
 

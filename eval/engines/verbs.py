@@ -15,6 +15,7 @@ from xreset.files.checks import Json, JsonOrPage, Option, PositiveInt, obeys_rul
 from xreset.files.progress import NamedProgress, unseen
 from xreset.files.records import replaces
 from xreset.files.storage import file_hash, measured, write_json, write_whole
+from xreset.files.text import texts
 from xreset.physics.plugins import Device, backend_class
 
 if TYPE_CHECKING:
@@ -57,7 +58,7 @@ def check_engines(
     from xreset.geometry.description import load_robot
 
     spec = load_robot(robot) if robot else conformance.scene().robot
-    names = [engines] if isinstance(engines, str) else dict.fromkeys(engines)
+    names = texts(engines)
     for name in names:  # before minutes of checks
         backend_class(name).engine_version()
     runs = [contract.check(name, spec, device, only, say) for name in names]

@@ -21,7 +21,7 @@ from xreset.eval.stats import Table
 from xreset.files.checks import first_repeated, frozen
 from xreset.files.records import write_npz
 from xreset.files.storage import file_hash
-from xreset.files.text import short_name, shown
+from xreset.files.text import short_name, shown, texts
 from xreset.geometry.description import load_robot
 from xreset.spec import RobotSpec
 
@@ -98,7 +98,7 @@ def read_recorded(
     intervals: dict[float, Path] = {}
     inputs: dict[str, str] = {}
     every = [folders] if isinstance(folders, str | Path) else folders
-    wanted = [engines] if isinstance(engines, str) else engines
+    wanted = texts(engines)
     places = [results_in(Path(folder)) for folder in every]
     if (i := first_repeated([place.resolve() for place in places])) is not None:
         raise RunError(f"The results in {places[i]} are given twice. Give each folder once.")

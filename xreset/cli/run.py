@@ -15,7 +15,7 @@ from xreset.errors import RunError
 from xreset.files.checks import PositiveFloat, PositiveInt, Seed, obeys_rules
 from xreset.files.records import stated_inputs
 from xreset.files.storage import claim_folder, file_hash
-from xreset.files.text import quantity
+from xreset.files.text import quantity, texts
 from xreset.learning.run import read_run
 from xreset.physics.plugins import Device, backend_class, robot_names
 from xreset.policy.shipped import shipped_checkpoints, shipped_name
@@ -98,8 +98,7 @@ def run(
 
         networks_to_start_with(weights, [spec], config)
     shared_worlds(archive.object_names, num_envs, task.reset.object_share)
-    named = [engine] if isinstance(engine, str) else engine
-    engines = quick_engines(named, "cpu")
+    engines = quick_engines(texts(engine), "cpu")
     backend_class(ENGINE).engine_version()
     if minutes is None and iterations is None:
         minutes = _MINUTES if weights is None else _MINUTES_ON

@@ -29,7 +29,7 @@ from xreset.files.records import (
     record_problem,
     write_record,
 )
-from xreset.files.text import Brief, shown
+from xreset.files.text import Brief, shown, texts
 from xreset.geometry.shapes import quat_of, turn_of
 from xreset.objects.catalogue import canonical_names, load_object, object_names, official_name
 from xreset.objects.rest import rest_height
@@ -244,9 +244,9 @@ class Demos(ObjectMotions):
             )
         return kept, self.select(indices=others)
 
-    def _known(self, field: str, wanted: Iterable[str]) -> list[str]:
+    def _known(self, field: str, wanted: Iterable[str]) -> tuple[str, ...]:
         """Return the wanted values of a field, all of which exist."""
-        wanted = [wanted] if isinstance(wanted, str) else list(wanted)
+        wanted = texts(wanted)
         known = np.unique(getattr(self, field)).tolist()
         if missing := [name for name in wanted if name not in known]:
             what = field.removesuffix("_name").replace("_", " ")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import reprlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import PurePath
 from typing import Any
 
@@ -26,6 +26,11 @@ def shown(value: Any) -> str:
     except ValueError:  # Python refuses to write thousands of digits
         text = "a number of thousands of digits"
     return text if len(text) <= 200 else f"{text[:160]}...{text[-30:]}"
+
+
+def texts(given: str | Iterable[str]) -> tuple[str, ...]:
+    """Return texts of which a user gave one or several, each once."""
+    return (given,) if isinstance(given, str) else tuple(dict.fromkeys(given))
 
 
 def listed(names: Sequence[str]) -> str:

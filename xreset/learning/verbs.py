@@ -155,10 +155,7 @@ def train(
     if teacher is not None:
         teacher_policy = training.read_teacher(teacher, inputs, config)
     info = RunInfo(
-        robot=str(inputs.robot_name),
-        resets=str(inputs.path),
-        resets_hash=str(inputs.hash),
-        meshes=str(inputs.meshes) if inputs.meshes else None,
+        **vars(_robot_data(inputs)),
         engine=engine,
         engine_version=version,
         device=device,

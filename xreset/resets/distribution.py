@@ -54,11 +54,6 @@ class Reset(Tensors):
     sequence: Tensor
     """[M] index of the demonstration."""
 
-    @property
-    def from_bank(self) -> Tensor:
-        """[M] bool"""
-        return self.state >= 0
-
 
 @frozen
 class _Demonstrations(Tensors):

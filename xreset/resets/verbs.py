@@ -16,6 +16,7 @@ from xreset.errors import XResetError
 from xreset.files.checks import Option, OutputFile, PositiveInt, Seed, obeys_rules
 from xreset.files.progress import NamedProgress, Progress, unseen
 from xreset.files.records import replaces
+from xreset.files.text import texts
 from xreset.physics.plugins import Device
 from xreset.resets.config import ClosingConfig, FilterConfig, SqueezeConfig, TransferConfig
 
@@ -92,7 +93,7 @@ def make_bank(
         note(doubt)
     motion = inputs.motion()
     scene = (inputs.robot, inputs.objects)
-    engines = (engine,) if isinstance(engine, str) else tuple(dict.fromkeys(engine))
+    engines = texts(engine)
     if not engines:
         raise XResetError("No engine is named. Name one or several of them.")
     limits = limits or FilterConfig()

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from xreset.files.checks import Option, Output, Png, PositiveInt, obeys_rules
 from xreset.files.progress import NamedProgress, Progress, unseen
 from xreset.files.storage import this_command
+from xreset.files.text import texts
 from xreset.physics.plugins import Device
 from xreset.resets.config import SqueezeConfig
 from xreset.robot_tools.placement import Finalist, PlaceConfig, write_placement
@@ -204,12 +205,11 @@ def judge(
     from xreset.robot_tools.judge import judge_picture, try_grasps
 
     inputs = load_inputs(bank, robot=robot, objects=objects, meshes=meshes, accept=("bank",))
-    chosen = (engines,) if isinstance(engines, str) else tuple(dict.fromkeys(engines))
     found = try_grasps(
         inputs.bank,
         inputs.robot,
         inputs.objects,
-        chosen,
+        texts(engines),
         states=states,
         squeeze=squeeze,
         device=device,

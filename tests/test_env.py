@@ -60,6 +60,8 @@ TASK = TaskConfig(
     distance_points=64,
 )
 QUIET = replace(TASK, observation=TASK.observation.without_noise())
+REST = torch.zeros(N, 7)
+"""Actions."""
 
 
 class BreakableBackend(MujocoBackend):
@@ -203,7 +205,7 @@ class RefusalTest(WithEnv):
 
     def test_what_is_not_one_value_for_each_world_is_refused(self):
         env = self.make()
-        still = torch.zeros(N, 7)
+        still = REST
         before = (env.worlds.clone(), vars(env.backend.state().clone()))
         for call, words in (
             (lambda: env.step(still[0]), r"expected \(3, 7\)"),
@@ -250,7 +252,7 @@ class StepTest(WithEnv):
     def test_actions_reach_the_drives(self):
         env = self.make()
         before = env.joint_target.clone()
-        action = torch.zeros(N, 7)
+        action = REST
         action[1, 1] = 1.0
         action[2, 3] = 2.0
         env.step(action)
@@ -359,21 +361,21 @@ class ResetTest(WithEnv):
         env.episode_length_buf[:] = env.max_episode_length - 1
         expected = torch.zeros(3)
         expected[env.sequence[0]] += 0.05
-        env.step(torch.zeros(N, 7))
+        env.step(REST)
         assert_close(env.resets.success_rate, expected)
         # as at the start of a training, and after each break
         env.resets.success_rate.fill_(1.0)
         env.episode_length_buf = torch.full((N,), env.max_episode_length - 1)
-        _, _, done, _ = env.step(torch.zeros(N, 7))
+        _, _, done, _ = env.step(REST)
         self.assertTrue(done.all())
         assert_close(env.resets.success_rate, torch.ones(3), msg="the episodes were cut short")
         env.episode_length_buf[:] = env.max_episode_length - 1
         env.goal_pos += 0.3
-        env.step(torch.zeros(N, 7))
+        env.step(REST)
         self.assertLess(float(env.resets.success_rate.min()), 1.0)
         env.resets.success_rate.fill_(1.0)
         env.backend.overflow[:] = True
-        env.step(torch.zeros(N, 7))
+        env.step(REST)
         assert_close(env.resets.success_rate, torch.ones(3), msg="the simulations failed")
 
     def test_starts_come_from_the_distribution_and_may_press(self):
@@ -471,7 +473,7 @@ class RobustnessTest(WithEnv):
             state = each.backend.state()
             raised = state.object_pos + tensor([0.0, 0.0, 0.3])
             each.backend.set_state(replace(state, object_pos=raised))
-            each.step(torch.zeros(N, 7))
+            each.step(REST)
         pushes = env.variation.pushes
         pushed = env.backend.state()
         free = same.backend.state()
@@ -490,7 +492,7 @@ class RobustnessTest(WithEnv):
         push = PushConfig(probability=(1.0, 1.0), object_velocity=0.5, arm_torque=0.5, when="gated")
         env = self.make(self.task(push=push))
         with patch.object(env.backend, "set_joint_targets") as sent:
-            env.step(torch.zeros(N, 7))
+            env.step(REST)
         pushes = env.variation.pushes
         self.assertFalse(pushes.force.any())
         share = tensor([joint.drive.kp / joint.drive.effort for joint in self.robot.joints])
@@ -498,7 +500,7 @@ class RobustnessTest(WithEnv):
         self.assertTrue((torque[:, :3].abs() <= 0.5001).all() and (torque[:, :3] != 0).all())
         self.assertFalse(torque[:, 3:].any())
         pushes.gate.fill_(True)
-        env.step(torch.zeros(N, 7))
+        env.step(REST)
         self.assertGreater(pushes.force.norm(dim=-1).min(), 0.0)
         pushes.gate.fill_(True)
         env.reset(tensor([1]))
@@ -668,13 +670,13 @@ class FailureTest(WithEnv):
         pos = state.object_pos.clone()
         pos[0, 2] = 2.0
         env.backend.set_state(replace(state, object_pos=pos))
-        _, reward, done, extras = env.step(torch.zeros(N, 7))
+        _, reward, done, extras = env.step(REST)
         self.assertEqual((done.tolist(), extras["time_outs"].tolist()), ([1] * N, [0.0, 1.0, 1.0]))
         self.assertAlmostEqual(reward[0], -5.0, delta=0.02)
         self.assertGreater(reward[1:].min(), -0.02)
         env = self.make(replace(TASK, object_frame="center"))
         env._center[1, 2] -= 0.5
-        done = env.step(torch.zeros(N, 7))[2]
+        done = env.step(REST)[2]
         self.assertEqual(done.tolist(), [0, 1, 0], "the task's origin of the object is judged")
 
     def test_a_world_that_fails_ends_teaches_nothing_and_is_counted_once(self):

@@ -84,6 +84,11 @@ class UrdfTest(InFolder):
         path.write_text(f'<robot name="toy"><link name="base"/>{"".join(parts)}</robot>')
         return path
 
+    def with_mesh(self, name):
+        """A URDF with a link ``end`` of the shape in a file."""
+        shape = f'<collision><geometry><mesh filename="{name}"/></geometry></collision>'
+        return self.urdf(f'<link name="end">{shape}</link>', FIXED.format(name="j", child="end"))
+
     def test_what_is_not_a_file_is_refused_at_once(self):
         pipe = self.folder / "pipe.urdf"
         os.mkfifo(pipe)
@@ -94,8 +99,7 @@ class UrdfTest(InFolder):
     def test_a_changed_mesh_is_read_again(self):
         mesh = self.folder / "box.stl"
         trimesh.creation.box((0.1, 0.1, 0.1)).export(mesh)
-        shape = '<collision><geometry><mesh filename="box.stl"/></geometry></collision>'
-        path = self.urdf(f'<link name="end">{shape}</link>', FIXED.format(name="j", child="end"))
+        path = self.with_mesh("box.stl")
         self.assertIs(load_urdf(path), load_urdf(path))
         trimesh.creation.box((0.3, 0.1, 0.1)).export(mesh)
         os.utime(mesh, ns=(1, 1))
@@ -107,9 +111,7 @@ class UrdfTest(InFolder):
         trimesh.creation.box((10, 20, 30)).export(mesh)
         unit = '<unit name="centimeter" meter="0.01"/></asset>'
         mesh.write_text(mesh.read_text().replace("</asset>", unit))
-        shape = '<collision><geometry><mesh filename="box.dae"/></geometry></collision>'
-        joint = FIXED.format(name="j", child="end")
-        tree = load_urdf(self.urdf(f'<link name="end">{shape}</link>', joint))
+        tree = load_urdf(self.with_mesh("box.dae"))
         vertices = np.asarray(tree.link("end").collisions[0].geometry.vertices)
         assert_allclose(np.ptp(vertices, axis=0), (0.1, 0.2, 0.3))
 
@@ -166,8 +168,7 @@ class UrdfTest(InFolder):
 
     def test_meshes_that_are_archives_and_other_files_are_refused(self):
         (self.folder / "box.zip").write_bytes(b"PK")
-        shape = '<collision><geometry><mesh filename="box.zip"/></geometry></collision>'
-        path = self.urdf(f'<link name="end">{shape}</link>', FIXED.format(name="j", child="end"))
+        path = self.with_mesh("box.zip")
         self.assertRaisesRegex(RobotError, "is an archive. Unpack it", load_urdf, path)
         path.write_text("<mujocoinclude/>")
         with self.assertRaisesRegex(RobotError, "starts with <mujocoinclude>.*Expected <robot>"):

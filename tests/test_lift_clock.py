@@ -88,13 +88,17 @@ LOG = {
 }
 
 
+def learn(log, iteration=1, **numbers):
+    """Let a log write an iteration of one step, in which no world ends."""
+    log.add(torch.ones(2), torch.zeros(2), LOG)
+    log.write(iteration, 10, 60.0, {"speed/env_steps_per_second": 2.0} | numbers)
+
+
 class CurvesTest(InFolder):
     def test_while_a_teacher_acts_success_is_not_the_students(self):
         curves = TrainingLog(self.folder, 2, "cpu", 5)
         for iteration, share in ((1, 0.5), (2, 0.0)):
-            curves.add(torch.ones(2), torch.zeros(2), LOG)
-            numbers = {"speed/env_steps_per_second": 2.0, "policy/teacher_share": share}
-            curves.write(iteration, 10, 60.0, numbers)
+            learn(curves, iteration, **{"policy/teacher_share": share})
             found = (curves.lift.iteration, curves.lift.minutes, curves.lift.success_from_home)
             self.assertEqual(found, (iteration, 1.0, 0.0 if share else 0.5))
             self.assertEqual({p.iteration for p in curves.lift.passed}, set() if share else {2})
@@ -126,8 +130,7 @@ class CurvesTest(InFolder):
         first = TrainingLog(self.folder, 2, "cpu", 5)
         second = TrainingLog(self.folder, 2, "cpu", 5)
         for iteration, log in enumerate((first, second), 1):
-            log.add(torch.ones(2), torch.zeros(2), LOG)
-            log.write(iteration, 10, 60.0, {"speed/env_steps_per_second": 2.0})
+            learn(log, iteration)
         self.assertEqual(threading.active_count(), threads)
         self.assertIs(threading.excepthook, hook)
         found = read_curves(self.folder)
@@ -148,8 +151,7 @@ class CurvesTest(InFolder):
                 XResetError, "learning curves into .*No space left.*same command"
             ),
         ):
-            curves.add(torch.ones(2), torch.zeros(2), LOG)
-            curves.write(1, 10, 60.0, {"speed/env_steps_per_second": 2.0})
+            learn(curves)
         self.assertEqual(said.getvalue(), "")
         curves.close()
 
@@ -160,8 +162,7 @@ class CurvesTest(InFolder):
             for project in (None, "project"):
                 write_json(f"{folder}/run.json", {"a": 1})
                 curves = TrainingLog(folder, 2, "cpu", 5, project)
-                curves.add(torch.ones(2), torch.zeros(2), LOG)
-                curves.write(3, 10, 1.0, {"speed/env_steps_per_second": 2.0})
+                learn(curves, 3)
                 self.assertEqual(len(read_lift(folder).passed), 3, "a passing is on disk at once")
                 curves.close()
                 self.assertEqual(online.init.called, project is not None)

@@ -68,6 +68,12 @@ class Reported(InFolder):
     def write_soup(self):
         self.write_run("", TrainConfig(iterations=500), num_envs=4096, seed=7)
 
+    def read(self):
+        return read_trainings([self.folder])
+
+    def collect(self):
+        return collect(self.read())
+
 
 def table_of(*episodes, engine="mujoco"):
     return toy_result(engine, replace(toy_rollouts(), episodes=episodes)).to_frame()
@@ -106,12 +112,6 @@ class Outline(HTMLParser):
 
 
 class CollectTest(Reported):
-    def read(self):
-        return read_trainings([self.folder])
-
-    def collect(self):
-        return collect(self.read())
-
     def test_a_run_a_baseline_and_a_bare_folder(self):
         self.write()
         self.assertIsNone(self.read()[0].run)
@@ -354,7 +354,7 @@ class ClipTest(Reported):
             mock.patch("xreset.eval.report.clips.encode_mp4") as encode,
         ):
             encode.return_value = b"film"
-            (training,) = read_trainings([self.folder])
+            (training,) = self.read()
             file = self.folder / "film.mp4"
             objects = make_film([training], file, progress=lambda *done: drawn.append(done))
         frames, fps = encode.call_args.args
@@ -433,7 +433,7 @@ class FailureTest(Reported):
 class PlotTest(Reported):
     def test_a_drawing_takes_the_pages_colour_and_size(self):
         self.write(("mujoco",))
-        (training,) = read_trainings([self.folder])
+        (training,) = self.read()
         groups = {"run": [replace(training, curves=CURVES)]}
         drawing = draw_training(groups, "iterations")
         self.assertTrue(drawing.startswith("<svg") and drawing.endswith("</svg>"))
@@ -462,14 +462,13 @@ class PageTest(Reported):
 
     def report(self, **changes):
         """The report of the folder, with films; ``changes`` replace its fields."""
-        report = collect(read_trainings([self.folder]))
-        return replace(report, clips=self.clips, strips=self.strips, **changes)
+        return replace(self.collect(), clips=self.clips, strips=self.strips, **changes)
 
     def whole(self):
         """The report of a run with results and learning curves."""
         self.write()
         self.write_soup()
-        (training,) = read_trainings([self.folder])
+        (training,) = self.read()
         report = collect([replace(training, curves=CURVES)])
         return replace(report, clips=self.clips, strips=self.strips)
 
@@ -528,15 +527,12 @@ class PageTest(Reported):
         (self.folder / "run.json").unlink()
         self.assertIn(words, page(self.report()))
 
-    def without_films(self):
-        return collect(read_trainings([self.folder]))
-
     def test_without_clips_curves_and_run(self):
         self.write(engines=("pybullet",), episode_seconds=12.0)
-        text = page(self.without_films())
+        text = page(self.collect())
         self.assertIn("4 of 12 s in each engine: 2 demonstrations", Outline(text).text)
         self.write(engines=("mujoco",), episode_seconds=5.0)
-        both = Outline(page(self.without_films())).text
+        both = Outline(page(self.collect())).text
         self.assertIn(
             "4 in each engine, of 5 s in mujoco, of 12 s in pybullet: 2 demonstrations", both
         )
@@ -555,7 +551,7 @@ class PageTest(Reported):
         text = page(replace(report, trainings=named, notes=(hostile,)))
         self.assertNotIn("<script>alert", text)
         self.write(policy=hostile)
-        text = page(self.without_films())
+        text = page(self.collect())
         self.assertNotIn("<script>alert", text)
         self.assertIn(hostile, Outline(text).text)
 
@@ -565,7 +561,7 @@ class PageTest(Reported):
             self.write((engine,), rollouts_with(*[mean] * 4))
         self.write_soup()
         self.assertEqual(
-            headline(read_trainings([self.folder])),
+            headline(self.read()),
             "Task progress is 90% in mujoco-warp, 50% in sapien, 40% in mujoco, 10% in pybullet. "
             "The policy was trained in mujoco-warp.",
         )

@@ -323,6 +323,10 @@ class TablesTest(Studied):
         result = toy_result("mujoco", rollouts, robot="openarm", seed=0, **changes)
         write_result(self.out / name / "eval", result, rollouts.traces, ("a", "b", "c"))
 
+    def rows(self, plan, number=0):
+        """The rows of one of the study's tables."""
+        return fill(plan, plan.study.tables[number]).engines["mujoco"]
+
     def test_our_figures_are_next_to_the_papers(self):
         self.write("ours-seed0", 1.0, 1.0, 0.33, 0.33)
         self.write("ours-seed1", 0.66, 0.66, 0.33, 0.33)
@@ -379,13 +383,13 @@ class TablesTest(Studied):
         self.write("ours-tomato_soup_can-seed0", 1.0, 0.33)
         text = self.TEXT.replace("[runs.ours]\n", "[runs.ours]\nalone = true\n")
         plan = self.plan(text)
-        rows = fill(plan, plan.study.tables[0]).engines["mujoco"]
+        rows = self.rows(plan)
         self.assertRegex(rows[1][3], r"^66\.5 ")
         self.assertEqual([r[3][0] for r in rows[2:]], ["-", "-"])
         # now seed 0 lacks an object, seed 1 does not
         self.write("ours-tomato_soup_can-seed1", 1.0, 0.33)
         self.write("ours-potted_meat_can-seed1", 0.66, 0.0, first=2)
-        rows = fill(plan, plan.study.tables[0]).engines["mujoco"]
+        rows = self.rows(plan)
         self.assertRegex(rows[1][3], r"^66\.5 \(24-92\)", "one demonstration is little")
         self.assertRegex(rows[3][3], r"^49\.8 ", "seed 1 alone")
         notes = write_page(plan, self.folder / "page").notes
@@ -398,7 +402,7 @@ class TablesTest(Studied):
         missing = Mock(reason="not installed")
         with patch("xreset.eval.study.plan.backend_status", return_value=missing):
             plan = self.plan(self.TEXT)
-        rows = fill(plan, plan.study.tables[1]).engines["mujoco"]
+        rows = self.rows(plan, 1)
         self.assertEqual(
             [row[0] for row in rows[1:]], ["tomato soup can", "potted meat can", "all of them"]
         )
@@ -418,7 +422,7 @@ class TablesTest(Studied):
         plan = self.plan(self.TEXT)
         for *progress, inputs in ((0.6, 0.6, 0.6, {}), (0.6, 0.6, 0.6, 0.6, {"demos": "other"})):
             self.write("ours-seed1", *progress, **({"inputs": inputs} if inputs else {}))
-            rows = fill(plan, plan.study.tables[0]).engines["mujoco"]
+            rows = self.rows(plan)
             self.assertTrue(all(row[-1].startswith("-") for row in rows[1:]), rows)
             notes = write_page(plan, self.folder / "page").notes
             self.assertTrue(any("These results are not comparable" in n for n in notes), notes)

@@ -727,7 +727,6 @@ class TrainingTest(WithBank):
     def test_what_cannot_be_trained_is_refused_and_leaves_no_run(self):
         cloud = {"cloud": {"frames": 3, "noise": 0.002, "scale": 1.0}}
         observation = replace(CONFIG.task.observation, perception=cloud)
-        short = replace(CONFIG, task=replace(CONFIG.task, observation=observation))
         wide = replace(CONFIG, model=replace(CONFIG.model, lstm=16))
         bank = toy_bank(self.robot)
         empty = bank.with_states(np.zeros(6, dtype=bool))
@@ -735,6 +734,7 @@ class TrainingTest(WithBank):
         def with_task(**changes):
             return replace(CONFIG, task=replace(CONFIG.task, **changes))
 
+        short = with_task(observation=observation)
         flat = replace(observation, perception={"object_pos": {"noise": 0.0}})
         double = replace(observation, policy=observation.policy | cloud)
         nothing = replace(observation, privileged={})
@@ -792,19 +792,19 @@ class TrainingTest(WithBank):
             ),
             self.assertRaisesRegex(RunError, "gone"),
         ):
-            self.train("refused", bank=toy_bank(self.robot))
+            self.train("refused", bank=bank)
         self.assertFalse((self.folder / "refused").exists())
         (self.folder / "refused").mkdir()
         with (
             claim(self.folder / "refused"),
             self.assertRaisesRegex(XResetError, "nother (command|process) is writing"),
         ):
-            self.train("refused", bank=toy_bank(self.robot))
+            self.train("refused", bank=bank)
         self.assertEqual([f for f in (self.folder / "refused").rglob("*") if f.is_file()], [])
-        bank = self.folder / "changing.npz"
-        write_bank(bank, toy_bank(self.robot))
-        out = self.train("changed", bank=bank, config=ONE)
-        write_bank(bank, empty)
+        file = self.folder / "changing.npz"
+        write_bank(file, bank)
+        out = self.train("changed", bank=file, config=ONE)
+        write_bank(file, empty)
         with self.assertRaisesRegex(RunError, "not the file that this run was started with"):
             self.resume(out, iterations=2)
 

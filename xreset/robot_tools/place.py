@@ -139,7 +139,6 @@ def _rank(reached: tuple[float, float]) -> tuple[int, float]:
     return round(reached[0] * 200), reached[1]
 
 
-@one_thread()
 def _followed(
     robot: RobotSpec, wrists: ArmTargets, paths: list[ArmTargets]
 ) -> tuple[float, float, int]:

@@ -26,7 +26,7 @@ from xreset.files.checks import (
 from xreset.files.progress import NamedProgress, Progress, unseen
 from xreset.files.records import replaces
 from xreset.files.storage import claim_folder, must_be_new
-from xreset.files.text import quantity
+from xreset.files.text import quantity, texts
 from xreset.physics.plugins import Device
 
 if TYPE_CHECKING:
@@ -293,11 +293,10 @@ def run_study(
     from xreset.eval.study.file import read_study, study_path
 
     path = study_path(str(study))
-    chosen = [runs] if isinstance(runs, str) else runs
 
     def planned() -> plan.Plan:
         return plan.make_plan(
-            read_study(path), path.stem, given=Path(data), out=Path(out), only=chosen
+            read_study(path), path.stem, given=Path(data), out=Path(out), only=texts(runs)
         )
 
     todo = planned()

@@ -29,7 +29,7 @@ def shown(value: Any) -> str:
 
 
 def texts(given: str | Iterable[str]) -> tuple[str, ...]:
-    """Return texts of which a user gave one or several, each once."""
+    """Return the texts that a user gave, one or several, without repeats."""
     return (given,) if isinstance(given, str) else tuple(dict.fromkeys(given))
 
 

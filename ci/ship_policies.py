@@ -50,8 +50,14 @@ def halved(content: bytes) -> bytes:
 
 
 def halved_checkpoint(run: Path, network: bytes) -> bytes:
-    """Return what another training starts from: the policy and the critic of a run's newest checkpoint, large weights
-    in half precision, without those that the policy's file has (its content)."""
+    """Return a checkpoint from which another training starts: the policy and the critic of a run's newest one.
+
+    Large weights are in half precision. Weights that the policy's file has are left out.
+
+    Args:
+        run: run folder.
+        network: content of the policy's file.
+    """
     content = read_checkpoint(latest_checkpoint(run))
     actor = halved_state(content.policy_state_dict)
     content = replace(

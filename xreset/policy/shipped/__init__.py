@@ -18,8 +18,6 @@ from xreset.physics.plugins import robot_names
 FOLDER = Path(__file__).parent
 """Folder of the policies and their cards."""
 SCHEMA = "xreset-policy-card/1"
-CUT = b"["
-"""How a file begins out of which weights were cut."""
 
 
 @frozen
@@ -93,13 +91,14 @@ def graph_of(network: bytes) -> bytes | None:
 
 
 def whole(file: Path) -> bytes:
-    """Return a file's content with the weights that were cut out of it because its policy's file has them.
+    """Return the content of a file, together with the weights that it leaves to its policy's file.
 
-    ``ci/ship_policies.py`` writes such files next to ``NAME.onnx``. A line of JSON lists the cuts: where in the rest a
-    piece was, and its offset and length in the policy's file. The rest follows. Other files are returned as they are.
+    ``ci/ship_policies.py`` writes such files next to ``NAME.onnx``. They begin with a list in a line of JSON, which has
+    an entry for each piece that was cut out: its place in the rest, and its offset and length in the policy's file. The
+    rest follows. Other files are returned as they are.
     """
     content = file.read_bytes()
-    if not content.startswith(CUT):
+    if not content.startswith(b"["):
         return content
     network = file.with_suffix(".onnx").read_bytes()
     cuts, _, rest = content.partition(b"\n")

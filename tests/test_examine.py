@@ -209,6 +209,8 @@ class Wrong(InFolder):
         first = int(np.argmax(to_goal < 0.1))
         lost = demos.object_pos.copy()
         lost[first : first + 12] = lost[first]
+        lost_at_the_end = demos.object_quat_wxyz.copy()
+        lost_at_the_end[56:] = (1, 0, 0, 0)
         still = {"object_pos": demos.object_pos / 1e3}
         flat = np.where(demos.hand_valid[:, None, None], hand.keypoints(_FLAT), np.nan)
         flat += demos.hand_keypoints[:, :1]
@@ -224,9 +226,14 @@ class Wrong(InFolder):
         }
         for words, wrong, changed in (
             (
-                "does not change at all for 0.3 s or longer, and then jumps",
+                "does not change at all for 0.3 s or longer, before or after a jump",
                 False,
                 {"object_pos": lost},
+            ),
+            (
+                "before or after a jump, first in frame 56",
+                False,
+                {"object_quat_wxyz": lost_at_the_end},
             ),
             ("comes no nearer to the object than", True, still),
             (

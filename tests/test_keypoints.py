@@ -144,6 +144,7 @@ class Synthetic(InFolder):
             ("--order mano", written(points, "mano")),
             ("relative to the hand", points - points.mean(axis=1, keepdims=True)),
             ("The keypoints are not metric", points[:, :1] + swelling * from_wrist),
+            ("write NaN, where the hand was not seen", np.where(swelling < 1.8, -1.0, points)),
         ):
             self.refused(words, keypoints=changed)
         other = "It is the other hand .*or the coordinates are left-handed"

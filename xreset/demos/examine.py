@@ -88,10 +88,10 @@ _REACH = 0.2
 _COPIES = 0.3
 """Share of frames in motion that repeat the frame before: 0."""
 _FROZEN = 0.3
-"""Longest time for which a hand may stay exactly where it is while its object moves, and an object before it jumps [s]:
-0."""
+"""Longest time for which a hand may stay exactly where it is while its object moves, and an object before or after a
+jump [s]: 0."""
 _GOES_ON = 0.02
-"""Step of an object's position with which it goes on where its tracker had lost it [m]."""
+"""Step of an object's position with which its tracker loses or finds it [m]."""
 _TURNS_ON = np.radians(5.0)
 """The same of its orientation [rad]."""
 _TREMBLES = 0.003
@@ -281,7 +281,7 @@ def _of_hand(r: Recording) -> Iterator[Finding]:
         return
     points = r.points[r.seen]
     size = np.linalg.norm(points - points[:, :1], axis=2).max(axis=1)
-    absent = size < _ONE_POINT * (np.median(size) > _ONE_POINT)
+    absent = size < _ONE_POINT * (size.max() > _ONE_POINT)
     if absent.any():
         yield _error(
             "absent",
@@ -522,8 +522,8 @@ def _of_motion(r: Recording) -> Iterator[Finding]:
     elif lost := _lost_frame(r):
         yield _doubt(
             "frozen",
-            f"The object's position or orientation does not change at all for {_FROZEN:g} s or longer, and then jumps,"
-            f" first in frame {lost}.",
+            f"The object's position or orientation does not change at all for {_FROZEN:g} s or longer, before or after"
+            f" a jump, first in frame {lost}.",
             "The tracker may have lost it: repair these frames, or leave the sequence out (xreset demos select"
             " --rest).",
         )
@@ -574,20 +574,21 @@ def _hand_jumps(r: Recording) -> np.ndarray:
 
 
 def _lost_frame(r: Recording) -> int:
-    """Return the first frame in which an object goes on with a jump after its position or its orientation did not
-    change at all for a while; 0 if there is none. The first step of one that stood still is no jump at a low rate."""
+    """Return the first frame to which an object jumps, before or after its position or its orientation does not change
+    at all for a while; 0 if there is none. The first step of one that stood still is no jump at a low rate."""
     quats = r.turn.as_quat()
     dt = 1.0 / r.fps
     step = np.linalg.norm(np.diff(r.pos, axis=0), axis=1)
     angle = r.step_turn.magnitude()
+    least = int(_FROZEN * r.fps) + 1
     for same, jumps in (
         (step == 0.0, step > _GOES_ON + _CALM * dt**2),
         ((quats[1:] == quats[:-1]).all(axis=1), angle > _TURNS_ON + _TURN_CALM * dt**2),
     ):
         for frame in np.flatnonzero(jumps).tolist():
-            begin = frame - int(_FROZEN * r.fps) - 1
-            if begin >= 0 and same[begin:frame].all():
-                return frame + 1
+            for stays in (same[:frame][-least:], same[frame + 1 :][:least]):
+                if len(stays) == least and stays.all():
+                    return frame + 1
     return 0
 
 

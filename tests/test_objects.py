@@ -245,7 +245,7 @@ class MeshImport(InFolder):
         inside_out = self.load(
             trimesh.Trimesh(BOX.vertices, BOX.faces[:, ::-1]), facts="mass = 1.0"
         )
-        self.assertEqual(inside_out.notes, ())
+        self.assertRegex(*inside_out.notes, "^triangles face inwards, and were turned")
         mesh = trimesh.Trimesh(inside_out.obj.vertices, inside_out.obj.faces, process=False)
         self.assertGreater(mesh.volume, 0)
 
@@ -452,11 +452,14 @@ class MeshImport(InFolder):
 
     def test_bad_meshes(self):
         obj = CUBE.export(file_type="obj")
+        crossing = BOX.copy()
+        crossing.vertices[0, 0] = 0.5
         square = "v 0 0 0\nv 0.1 0 0.1\nv 0 0.1 0.1\nv 0.1 0.1 0.2\nf 1 2 3\nf 2 4 3\n"
         for text, message in (
             ("", "no triangles|cannot be read"),
             (obj.replace("v ", "v nan ", 1), "finite|cannot be read"),
             (square, "flat"),
+            (crossing.export(file_type="obj"), "crosses itself"),
             (CUBE.copy().apply_scale(1000).export(file_type="obj"), "millimetres"),
             (_specks(1e-4), "bad.obj: .*smaller than a cube of 0.2 mm"),
             (_specks(1.9e-4), "bad.obj: .*smaller than a cube of 0.2 mm"),
@@ -572,6 +575,22 @@ class ThinWalls(InFolder):
                 self.assertEqual(len(pieces.shapes), 2)
                 self.assertAlmostEqual(pieces.volume, 2e-3, delta=1e-12)
                 assert_allclose(pieces.com, np.array(shift) / 2, atol=1e-12)
+
+    def test_parts_that_face_inwards_are_turned_but_for_cavities(self):
+        """Before, such a handle was no piece, and a moment of inertia was below zero."""
+        handle = trimesh.creation.box((0.08, 0.02, 0.02)).apply_translation((0.1, 0.0, 0.0))
+        space = trimesh.creation.box((0.08, 0.08, 0.08))
+        for part in (handle, space):
+            part.invert()
+        path = self.folder / "pan.stl"
+        trimesh.util.concatenate([CUBE, handle, space]).export(path)
+        volume = 0.1**3 - 0.08**3 + 0.08 * 0.02**2
+        self.assertAlmostEqual(read_mesh(path).volume, volume, delta=1e-9)
+        trimesh.util.concatenate([CUBE, handle]).export(path)
+        found = add_mesh(path, self.folder / "out", "pan", properties=Properties(mass=1.0))
+        self.assertRegex(*found.notes, "^triangles face inwards, and were turned")
+        self.assertEqual(len(found.obj.pieces), 2)
+        assert_allclose(found.obj.com, (0.0032 / 1.032, 0.0, 0.0), atol=1e-9)
 
     def test_slivers_whose_hull_is_flat_are_left_out(self):
         cube = Manifold.cube((0.1, 0.1, 0.1))

@@ -17,7 +17,7 @@ from xreset.errors import ObjectError
 from xreset.files.checks import frozen
 from xreset.files.storage import file_hash, write_whole
 from xreset.files.text import shown
-from xreset.geometry.shapes import load_mesh, mesh_arrays, shell_properties
+from xreset.geometry.shapes import load_mesh, mesh_arrays, shell_properties, winding_number
 from xreset.objects.cache import cached_pieces
 from xreset.objects.decompose import WALL, Pieces, Settings, openings
 from xreset.objects.properties import DENSITIES, MASSES, Properties, properties_of
@@ -38,10 +38,14 @@ _HOLLOW = 120.0
 """A closed mesh of a lower density is a shell [kg/m^3]."""
 _SPECK_AREA = 0.01
 """Largest share of a mesh's area that a part has which is a speck."""
+_BUBBLE = 1e-3
+"""Share of a mesh's volume up to which a part that faces inwards is a bubble, as scans have them."""
 _SPECK_GAP = 0.2
 """How far such a part is from the largest one, as a share of its length."""
 _FEW_MM = 0.002
 """Deviation of pieces from the surface that is worth a note [m]."""
+
+_TURNED = "triangles face inwards, and were turned. Those of a mirrored mesh do, too: compare it with the object"
 
 _log = logging.getLogger(__name__)
 
@@ -102,8 +106,9 @@ def import_with_notes(path: str | Path, name: str) -> Import:
         ObjectError: the file is missing, damaged, empty or flat, or not in metres.
     """
     path = Path(path)
-    notes = []
-    mesh = _without_specks(read_mesh(path), notes)
+    mesh = read_mesh(path)
+    notes = mesh.metadata["notes"]
+    mesh = _without_specks(mesh, notes)
     own = properties_of(path)
     known = _known_mass(name, own)
     source = mesh_source(path, own)
@@ -266,7 +271,7 @@ def add_mesh(
             raise ObjectError(str(error).replace(str(draft), str(path))) from error
     write_whole(facts, known)
     write_whole(target, text)
-    return result
+    return replace(result, notes=(*mesh.metadata["notes"], *result.notes))
 
 
 def read_mesh(path: Path, *, scale: float = 1.0) -> trimesh.Trimesh:
@@ -307,11 +312,45 @@ def _checked(mesh: trimesh.Trimesh, path: Path) -> trimesh.Trimesh:
     mesh.merge_vertices(merge_tex=True, merge_norm=True)  # texture seams are no holes
     mesh.update_faces(mesh.nondegenerate_faces())
     mesh.remove_unreferenced_vertices()
-    if mesh.is_watertight and mesh.is_winding_consistent and mesh.volume < 0:
-        mesh.invert()  # inside out
     if not len(mesh.faces) or mesh.extents.min() < _FLAT:
         raise ObjectError(f"{path} is flat: {_size(mesh)}; a solid object is needed.")
-    return _parted(mesh)
+    mesh = _parted(mesh)
+    mesh.metadata["notes"] = []
+    if mesh.is_watertight and mesh.is_winding_consistent:
+        if _turn_outward(mesh):
+            mesh.metadata["notes"].append(_TURNED)
+        least, middle, largest = np.linalg.eigvalsh(mesh.moment_inertia)
+        if min(least, least + middle - 0.999 * largest) <= 0:
+            raise ObjectError(
+                f"{path} crosses itself: its moments of inertia are those of no solid. Repair it, for example in"
+                " MeshLab."
+            )
+    return mesh
+
+
+def _turn_outward(mesh: trimesh.Trimesh) -> bool:
+    """Turn the parts of a closed mesh that face inwards, but for cavities, which are inside of other parts; return
+    whether there were any."""
+    before = mesh.faces
+    if mesh.volume < 0:
+        mesh.invert()
+    part = _parts(mesh)
+    volumes = np.bincount(part, np.linalg.det(mesh.triangles))
+    solid = mesh.faces[volumes[part] >= 0]
+    for number in np.flatnonzero(volumes < -_BUBBLE * volumes.sum()):
+        own = part == number
+        corners = mesh.vertices[mesh.faces[own].ravel()]
+        ends = corners[np.append(corners.argmin(axis=0), corners.argmax(axis=0))]
+        if winding_number(ends, mesh.vertices, solid).min() < 0.1:
+            mesh.faces = np.where(own[:, None], mesh.faces[:, ::-1], mesh.faces)
+    return bool((mesh.faces != before).any())
+
+
+def _parts(mesh: trimesh.Trimesh) -> np.ndarray:
+    """[F] number of the part of each triangle; an edge of two triangles joins them."""
+    import trimesh
+
+    return trimesh.graph.connected_component_labels(mesh.face_adjacency, len(mesh.faces))
 
 
 def _without_specks(mesh: trimesh.Trimesh, notes: list[str]) -> trimesh.Trimesh:
@@ -350,7 +389,7 @@ def _parted(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
 
     if mesh.is_watertight:
         return mesh
-    part = trimesh.graph.connected_component_labels(mesh.face_adjacency, len(mesh.faces))
+    part = _parts(mesh)
     corners = np.column_stack((part.repeat(3), mesh.faces.ravel()))
     own, faces = np.unique(corners, axis=0, return_inverse=True)
     parted = trimesh.Trimesh(mesh.vertices[own[:, 1]], faces.reshape(-1, 3), process=False)

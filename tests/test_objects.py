@@ -485,6 +485,8 @@ class MeshImport(InFolder):
             path = self.folder / f"{name}.obj"
             path.parent.mkdir(exist_ok=True)
             CUBE.export(path)
+        (self.folder / "024_bowl.toml").write_text("mass = 0.3")
+        self.assertEqual(load_object("bowl", self.folder).mass, 0.3)
         (self.folder / "._011_banana.obj").touch()  # what macOS leaves on other drives
         files = ["011_banana.obj", "024_bowl/textured.obj", "025_mug/textured_simple.obj"]
         self.assertEqual(
@@ -500,6 +502,11 @@ class MeshImport(InFolder):
             (self.folder / "nowhere", "no folder"),
         ):
             self.assertRaisesRegex(ObjectError, words, load_object, "soup", folder)
+        self.write(CUBE, "024_bowl")
+        with self.assertRaisesRegex(
+            ObjectError, "024_bowl.obj and .*textured.obj have the same name"
+        ):
+            mesh_files(self.folder)
 
     def test_a_real_can_stays_whole(self):
         obj = load_object("soup", data_dir() / "ycb")

@@ -33,7 +33,7 @@ def mesh_files(folder: str | Path) -> dict[str, Path]:
         YCB object set).
 
     Raises:
-        ObjectError: the folder does not exist or has no mesh.
+        ObjectError: the folder does not exist, has no mesh, or has an object in two layouts.
     """
     folder = Path(folder)
     expected = "Expected NAME.obj, NAME/textured_simple.obj or NAME/textured.obj."
@@ -42,8 +42,14 @@ def mesh_files(folder: str | Path) -> dict[str, Path]:
     if not os.path.isdir(folder):
         raise ObjectError(f"There is no folder {shown(str(folder))}. {expected}")
     found = {path.stem: path for path in folder.glob("[!.]*.obj")}
+    nested = {}
     for file in ("textured.obj", "textured_simple.obj"):  # the simpler one wins
-        found |= {path.parent.name: path for path in folder.glob(f"*/{file}")}
+        nested |= {path.parent.name: path for path in folder.glob(f"*/{file}")}
+    for name in found.keys() & nested.keys():
+        raise ObjectError(
+            f"{found[name]} and {nested[name]} have the same name. Remove one of them."
+        )
+    found |= nested
     if not found:
         raise ObjectError(f"There is no mesh in {folder}. {expected}")
     return dict(sorted(found.items()))

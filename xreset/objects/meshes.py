@@ -20,7 +20,13 @@ from xreset.files.text import shown
 from xreset.geometry.shapes import load_mesh, mesh_arrays, shell_properties, winding_number
 from xreset.objects.cache import cached_pieces
 from xreset.objects.decompose import WALL, Pieces, Settings, openings
-from xreset.objects.properties import DENSITIES, MASSES, Properties, properties_of
+from xreset.objects.properties import (
+    DENSITIES,
+    MASSES,
+    Properties,
+    properties_file,
+    properties_of,
+)
 from xreset.objects.ycb import MASSES as PUBLISHED_MASSES
 from xreset.spec import ObjectSpec
 
@@ -97,7 +103,7 @@ def import_with_notes(path: str | Path, name: str) -> Import:
     surface.
 
     Args:
-        path: mesh file, in metres, in the frame of the object's poses; NAME.toml next to it may state its properties
+        path: mesh file, in metres, in the frame of the object's poses; NAME.toml may state its properties
             (:mod:`xreset.objects.properties`).
         name: the object's name. The masses of the YCB object set are known by name, other masses follow from a
             density.
@@ -192,7 +198,7 @@ def _guessed_mass(
     if own.density is None:
         notes.append(
             f"its mass is unknown: {density * volume:.3g} kg is assumed, by a density of"
-            f" {density:.0f} kg/m^3. State `mass` in {path.with_suffix('.toml').name}"
+            f" {density:.0f} kg/m^3. State `mass` in {properties_file(path).name}"
         )
     return density * volume, f"{density:g} kg/m^3"
 

@@ -1,5 +1,5 @@
-"""Properties of an object, as ``NAME.toml`` next to its mesh: ``mass`` [kg] or ``density`` [kg/m^3], ``friction``, and
-``tolerance`` [m]."""
+"""Properties of an object, as ``NAME.toml`` in its folder of objects: ``mass`` [kg] or ``density`` [kg/m^3],
+``friction``, and ``tolerance`` [m]."""
 
 from __future__ import annotations
 
@@ -47,13 +47,23 @@ class Properties(Checked):
         )
 
 
+def properties_file(mesh: Path) -> Path:
+    """Return the file with the properties of a mesh ``NAME.obj`` or, in YCB's layout, ``NAME/textured.obj``:
+    ``NAME.toml``. A file next to the mesh comes first."""
+    own = mesh.with_suffix(".toml")
+    folder = mesh.absolute().parent
+    if mesh.stem.startswith("textured") and not own.is_file():
+        return folder.with_name(f"{folder.name}.toml")
+    return own
+
+
 def properties_of(mesh: Path) -> Properties:
-    """Read the file next to a mesh; nothing is known without a file.
+    """Read the properties of a mesh; nothing is known without a file.
 
     Raises:
         ObjectError: the file is damaged, or a value is out of range.
     """
-    path = mesh.with_suffix(".toml")
+    path = properties_file(mesh)
     if not path.is_file():
         return Properties()
     return from_dict(Properties, read_toml(path, error=ObjectError), str(path))

@@ -1,5 +1,6 @@
 """Demonstrations: the archive, DexYCB's layout, synthetic ones, and the commands."""
 
+import re
 from dataclasses import fields, replace
 from unittest import TestCase
 from unittest.mock import patch
@@ -495,13 +496,25 @@ class Synthetic(InFolder):
 
     def test_the_origin_of_ones_own_mesh_may_be_anywhere(self):
         found = []
+        rows = []
         shift = np.array([0.5, 0.9, 0.4])
         for at in (np.zeros(3), shift):
             mesh = trimesh.creation.box((0.05, 0.06, 0.12))
             mesh.apply_translation(at).export(self.folder / "brick.obj")
             found.append(synthesize(None, per_object=2, seed=0, fps=10, meshes=self.folder))
             self.assertEqual(examine(found[-1], surfaces_of(found[-1], self.folder)), [])
+            write_demos(self.folder / "a.npz", found[-1])
+            said = succeeds("demos select", self.folder / "a.npz", "--meshes", self.folder)
+            (line,) = re.findall(r"brick.*100%(.*)", said)
+            rows.append(re.findall(r"[\d.]+", line))
         centered, moved = found
+        goal, start = (pose[0] for pose in (centered.goal_pose, centered.start_pose))
+        turn = angles(centered.goal_pose[1], centered.start_pose[1])
+        way = 100 * np.median(np.linalg.norm(goal - start, axis=1))
+        for lift, distance, angle in np.array(rows, dtype=float):
+            self.assertAlmostEqual(lift, 100 * np.median((goal - start)[:, 2]), delta=0.2)
+            self.assertAlmostEqual(distance, way, delta=0.2)
+            self.assertAlmostEqual(angle, np.degrees(np.median(turn)), delta=1)
         middle = moved.object_pos + turn_of(moved.object_quat_wxyz).apply(shift)
         assert_allclose(middle, centered.object_pos, atol=0.002)
 

@@ -35,31 +35,34 @@ def _show_selected(found: tuple[Demos, Demos | None], options: Mapping[str, Any]
 
 def _summarize(demos: Demos, what: object, meshes: Path | None = None) -> None:
     """Print a row for each object, and the doubts about the recordings; meshes: what to examine them with."""
-    from xreset.demos.archive import start_to_goal
+    from xreset.demos.archive import demo_objects
     from xreset.demos.examine import examine, surfaces_of
+    from xreset.geometry.shapes import turn_of
 
+    objects = demo_objects(demos, meshes).values() if meshes else ()
     table = [("object", "right", "left", "frames", "hand", "lift, cm", "goal, cm", "goal, deg")]
     for name in demos.object_names:
         own = demos.select(objects=[name])
         right = np.count_nonzero(own.hand_side == "right")
-        first = own.frame_offsets[:-1]
-        height = own.object_pos[:, 2]
-        lift = np.median(np.maximum.reduceat(height, first) - height[first])
-        distance, angle = map(np.median, start_to_goal(own))
+        shift = own.shift([*objects])
+        lift = np.maximum.reduceat(shift[:, 2], own.frame_offsets[:-1])
+        goal = np.linalg.norm(shift[own.frame_offsets[1:] - 1], axis=1)
+        turn = turn_of(own.goal_pose[1]) * turn_of(own.start_pose[1]).inv()
         row = (
             name,
             f"{right}",
             f"{len(own) - right}",
             f"{own.num_frames}",
             f"{own.hand_valid.mean():.0%}",
-            f"{100 * lift:.1f}",
-            f"{100 * distance:.1f}",
-            f"{np.degrees(angle):.0f}",
+            f"{100 * np.median(lift):.1f}",
+            f"{100 * np.median(goal):.1f}",
+            f"{np.degrees(np.median(turn.magnitude())):.0f}",
         )
         table.append(row)
     show_table(
         table,
-        caption="right, left: sequences. hand: frames with a hand. lift, goal: medians, from the start",
+        caption="right, left: sequences. hand: frames with a hand. lift, goal: medians, from the start, of the center"
+        " of mass (with --meshes; else of the origin)",
     )
     console.print(
         f"{what}: {quantity(demos.num_sequences, 'sequence')}, {quantity(demos.num_frames, 'frame')} at "

@@ -409,14 +409,6 @@ def grounded(demos: Demos, objects: Mapping[str, ObjectSpec]) -> Demos:
     )
 
 
-def start_to_goal(demos: Demos) -> tuple[np.ndarray, np.ndarray]:
-    """Return the distance [S] in metres and the angle [S] in radians from each object's first to its last pose."""
-    start_pos, start_quat = demos.start_pose
-    goal_pos, goal_quat = demos.goal_pose
-    turn = turn_of(goal_quat) * turn_of(start_quat).inv()
-    return np.linalg.norm(goal_pos - start_pos, axis=1), turn.magnitude()
-
-
 def read_demos(path: str | Path) -> Demos:
     """Read an archive; all of it is checked before any of it is used. Objects get their official names.
 

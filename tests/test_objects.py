@@ -433,7 +433,7 @@ class MeshImport(InFolder):
         self.assertTrue(png.read_bytes().startswith(b"\x89PNG"))
         self.assertIn("brick", succeeds("objects import", out))
         again = refused(*command, "--out", out, "--name brick")
-        self.assertIn("choose another --name or --out", again)
+        self.assertIn("choose another name or folder", again)
         refused(*command, "--out", out, "--name", "[/bold]")
         (out / "brick.toml").write_text("density = 1000.0\ntolerance = 0.001\n")
         self.assertRegex(succeeds("objects import", out), r"brick\W+0.24\W+100x60x40\W+1 ")

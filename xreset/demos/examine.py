@@ -337,10 +337,11 @@ def _of_hand(r: Recording) -> Iterator[Finding]:
             "It is the other hand (--side), or the coordinates are left-handed, as Unity's are: negate one axis of"
             " keypoints and poses.",
         )
-    yield from _doubts_of_hand(r, bones)
+    yield from _doubts_of_hand(r)
 
 
 def _skeleton(points: np.ndarray) -> float:
+    """Return the length of the bones of keypoints [F, 21, 3] together, at the median [m]."""
     return float(np.median(bone_lengths(points).sum(axis=1)))
 
 
@@ -419,9 +420,10 @@ def _to_palm(points: np.ndarray, side: str) -> tuple[float, float]:
     return float(curl), float(thumb)
 
 
-def _doubts_of_hand(r: Recording, bones: np.ndarray) -> Iterator[Finding]:
+def _doubts_of_hand(r: Recording) -> Iterator[Finding]:
     """Yield what no or hardly any human hand does."""
-    length = float(np.median(bones.sum(axis=1)))
+    points = r.points[r.seen]
+    length = _skeleton(points)
     if not _SKELETON[0] <= length <= _SKELETON[1]:
         yield _doubt(
             "size",
@@ -430,7 +432,6 @@ def _doubts_of_hand(r: Recording, bones: np.ndarray) -> Iterator[Finding]:
             f"Its scale may be wrong by a factor of {_ADULT / length:.2f}, unless it is a child's hand.",
         )
     # a right hand's fingers point along the wrist's -x axis, a left hand's along +x
-    points = r.points[r.seen]
     fingers = points[:, [5, 9, 13, 17]].mean(axis=1) - points[:, 0]
     fingers /= np.linalg.norm(fingers, axis=1, keepdims=True).clip(1e-9)
     along = (turn_of(r.wrist[r.seen]).apply([1.0, 0.0, 0.0]) * fingers).sum(axis=1)

@@ -134,8 +134,15 @@ def read_keypoints(
             arrays = read_npz(file, None, _FILE, what="a tracker's keypoints")
             sequences = [{"sequence": np.array(name)} | arrays]
         for arrays in sequences:
-            what = f"{file}, sequence {arrays['sequence']}"
-            parts.append(sequence_of(arrays, what, convention, meshes=meshes, trust=trust))
+            try:
+                sequence = _sequence(arrays, convention)
+                if not trust:
+                    surfaces = surfaces_of(sequence, meshes)
+                    camera = convention.table_from_camera
+                    refuse_wrong(examine(sequence, surfaces, camera=camera), trust=False)
+            except DemoError as error:
+                raise DemoError(f"{file}, sequence {arrays['sequence']}: {error}") from None
+            parts.append(sequence)
     return merge_demos(parts)
 
 
@@ -257,27 +264,6 @@ def _numbers(table: dict[str, list[str]], column: str) -> np.ndarray:
 
 
 # One sequence ---------------------------------------------------------------------------------------------------------
-
-
-def sequence_of(
-    arrays: Arrays,
-    what: str,
-    convention: Convention,
-    *,
-    meshes: str | Path | None = None,
-    trust: bool = False,
-) -> Demos:
-    """Return one sequence from the arrays of a file; see :func:`read_keypoints` for options and errors, in which
-    ``what`` names the sequence."""
-    try:
-        sequence = _sequence(arrays, convention)
-        if not trust:
-            surfaces = surfaces_of(sequence, meshes)
-            found = examine(sequence, surfaces, camera=convention.table_from_camera)
-            refuse_wrong(found, trust=False)
-        return sequence
-    except DemoError as error:
-        raise DemoError(f"{what}: {error}") from None
 
 
 def _sequence(arrays: Arrays, convention: Convention) -> Demos:

@@ -26,6 +26,7 @@ from xreset.objects.properties import (
     Properties,
     properties_file,
     properties_of,
+    refuse_taken,
 )
 from xreset.objects.ycb import MASSES as PUBLISHED_MASSES
 from xreset.spec import ObjectSpec
@@ -254,13 +255,9 @@ def add_mesh(
             f"{shown(name)} cannot be an object's name. Use letters, digits, - and _."
         )
     target = folder / f"{name}.obj"
-    facts = target.with_suffix(".toml")
     properties = properties or Properties()
     known = replace(properties, tolerance=properties.tolerance or Settings.tolerance).to_toml()
-    if target.exists() or (facts.exists() and facts.read_bytes() != known.encode()):
-        raise ObjectError(
-            f"{target} or its .toml is there already. Nothing was changed; choose another --name or --out."
-        )
+    refuse_taken(target, known)
     from trimesh.exchange.obj import export_obj
 
     mesh = read_mesh(path, scale=scale)
@@ -275,7 +272,7 @@ def add_mesh(
             result = import_with_notes(draft, name)
         except ObjectError as error:  # the user knows only the mesh's own name
             raise ObjectError(str(error).replace(str(draft), str(path))) from error
-    write_whole(facts, known)
+    write_whole(target.with_suffix(".toml"), known)
     write_whole(target, text)
     return replace(result, notes=(*mesh.metadata["notes"], *result.notes))
 

@@ -18,7 +18,7 @@ from xreset.errors import ObjectError, needs
 from xreset.files.storage import write_whole
 from xreset.geometry.shapes import hull, loft, prism, section, shape_mesh
 from xreset.objects.catalogue import canonical_name
-from xreset.objects.properties import Properties
+from xreset.objects.properties import Properties, refuse_taken
 from xreset.objects.standins import stand_in
 from xreset.spec import Shape
 
@@ -65,12 +65,7 @@ def write_stand_in(name: str, folder: str | Path) -> Path:
     """
     obj = stand_in(canonical_name(name))
     path = Path(folder) / f"{obj.name}.obj"
-    facts = path.with_suffix(".toml")
-    # a command that was killed between the two files can be repeated
-    if path.exists() or (facts.exists() and facts.read_bytes() != _facts(obj.mass).encode()):
-        raise ObjectError(
-            f"{path} or its .toml is there already. Nothing was changed; choose another --out."
-        )
+    refuse_taken(path, _facts(obj.mass))
     _write(path, _union(obj.pieces), obj.mass)
     return path
 

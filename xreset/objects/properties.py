@@ -67,3 +67,13 @@ def properties_of(mesh: Path) -> Properties:
     if not path.is_file():
         return Properties()
     return from_dict(Properties, read_toml(path, error=ObjectError), str(path))
+
+
+def refuse_taken(mesh: Path, known: str) -> None:
+    """Raise ``ObjectError`` if a folder has a mesh, or other properties of it than the known ones: a command that was
+    killed between the two files can be repeated."""
+    path = mesh.with_suffix(".toml")
+    if mesh.exists() or (path.exists() and path.read_bytes() != known.encode()):
+        raise ObjectError(
+            f"{mesh} or its .toml is there already. Nothing was changed; choose another name or folder."
+        )

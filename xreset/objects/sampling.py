@@ -40,7 +40,7 @@ _SURFACE_POINTS: dict[tuple[bytes, int], np.ndarray] = {}
 
 def _spread_points(obj: ObjectSpec, count: int) -> np.ndarray:
     points, _, normals = sample_surface(
-        obj.vertices, obj.faces, max(_CANDIDATES_PER_POINT * count, 256), seed=0
+        obj.vertices, obj.faces, max(_CANDIDATES_PER_POINT * count, 256)
     )
     outside = winding_number(points + _PROBE * normals, obj.vertices, obj.faces) < 0.5
     return farthest_points(points[outside], count)
@@ -54,11 +54,11 @@ def metric_points(obj: ObjectSpec, frame: Frame = "mesh") -> np.ndarray:
 
 
 def sample_surface(
-    vertices: np.ndarray, faces: np.ndarray, count: int, seed: int = 0
+    vertices: np.ndarray, faces: np.ndarray, count: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return points [count, 3] uniform over the triangles' area, the triangle of each [count], and the triangles' unit
-    normals there [count, 3]."""
-    rng = np.random.default_rng(seed)
+    normals there [count, 3]; always the same ones."""
+    rng = np.random.default_rng(0)
     first, second, third = vertices[faces].swapaxes(0, 1)
     u = second - first
     v = third - first

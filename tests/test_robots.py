@@ -333,4 +333,9 @@ class Registry(Copied):
     def test_command_fails_on_errors_only(self):
         succeeds("robots check", self.folder)
         self.edit("robot.toml", {'palm = "palm"': 'palm = "plam"'})
-        self.assertIn("'plam'", refused("robots check", self.folder))
+        picture = self.folder / "robot.png"
+        said = refused("robots check", self.folder, "--picture", picture)
+        self.assertRegex(
+            said, r"error +links: hand.palm: the URDF has no link 'plam'[\s\S]*1 error"
+        )
+        self.assertFalse(picture.exists())

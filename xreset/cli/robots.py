@@ -42,8 +42,10 @@ def list_robots() -> None:
 
 
 def _show_check(findings: Sequence[Finding], options: Mapping[str, Any]) -> None:
+    from xreset.robot_tools.check import LAST
+
     _print_findings(findings)
-    if options["picture"] and findings[-1].topic not in ("description", "URDF"):
+    if options["picture"] and findings[-1].topic == LAST:
         console.print(f"wrote {options['picture']}")
     if any(finding.level == "error" for finding in findings):
         raise SystemExit(1)

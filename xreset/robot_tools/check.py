@@ -34,6 +34,8 @@ MOST_TOUCHING = 0.2
 """Share of the joint positions around home at which a robot may touch itself without a warning."""
 _LIMIT_SLACK = 1e-3
 """[rad or m] How far a mimic joint's limits may fall short of its source's: published figures are rounded."""
+LAST = "retargeting"
+"""Topic of the last finding about a robot that can be loaded."""
 _LISTED = 4
 """Pairs of links that are named, most frequent first."""
 _PALM = 0.12
@@ -113,7 +115,7 @@ def check(name_or_folder: str | Path) -> list[Finding]:
     )
     found += _topic("home and table", _above_table(kinematics, q))
     found += _topic("home and self", _free_of_itself(kinematics, q))
-    found += _topic("retargeting", _size(spec))
+    found += _topic(LAST, _size(spec))
     return found
 
 

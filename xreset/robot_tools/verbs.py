@@ -43,16 +43,16 @@ def check_robot(robot: str | Path, *, picture: Png | None = None) -> list[Findin
         picture: PNG to write: the robot at home, with the frames of its palm, fingertips and joints.
 
     Returns:
-        At least one finding for each topic; an error of ``description`` or ``URDF`` is the last one, and then there is
-        no picture.
+        At least one finding for each topic. After errors of description, URDF or inertias, home is skipped, and there
+        is no picture.
     """
     from xreset.geometry.description import load_robot
     from xreset.pictures.render import write_png
-    from xreset.robot_tools.check import check
+    from xreset.robot_tools.check import LAST, check
     from xreset.robot_tools.picture import robot_picture
 
     found = check(robot)
-    if picture is not None and found[-1].topic not in ("description", "URDF"):
+    if picture is not None and found[-1].topic == LAST:
         write_png(Path(picture), robot_picture(load_robot(robot)))
     return found
 

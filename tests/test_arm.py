@@ -350,4 +350,5 @@ class WritePlacementTest(InFolder):
         ):
             self.write(replace(self.best, home_rule=""))
         self.file.write_text(self.file.read_text().replace("pos = [", "position = ["))
-        self.assertRaisesRegex(RobotError, "edit it by hand", self.write, self.best)
+        words = r"Put base.pos = \[0.1, 0.2, 0.3\] .* and the arm's home = \[-0.3, -0.18333333, "
+        self.assertRaisesRegex(RobotError, words, self.write, self.best)

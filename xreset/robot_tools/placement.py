@@ -4,7 +4,7 @@ description."""
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable
 from math import inf
 from pathlib import Path
 from typing import Annotated
@@ -65,10 +65,11 @@ def write_placement(path: Path, robot: RobotSpec, best: Finalist, command: str) 
     """
     pos = _listed(best.robot.base_pos)
     quat = _listed(best.robot.base_quat)
+    by_hand = f"Put base.pos = {pos} and base.quat = {quat} into {path}, and "
     if not best.home_rule:
         raise RobotError(
-            f"robot {robot.name!r}: no placement has a home. Put base.pos = {pos} and base.quat = {quat} into {path}, "
-            "and choose a home of the arm's joints there: look at it with xreset robots check --picture."
+            f"robot {robot.name!r}: no placement has a home. {by_hand}choose a home of the arm's joints there: look at "
+            "it with xreset robots check --picture."
         )
     figures = f"reaches {100 * best.reached:.1f} % and follows {100 * best.followed:.1f} % of {best.frames} frames"
     edits = [(r"^quat *=.*()$", f"\n# Placement: {figures}: {' '.join(command.split())}")]
@@ -82,12 +83,13 @@ def write_placement(path: Path, robot: RobotSpec, best: Finalist, command: str) 
     for pattern, new in edits:
         match = re.search(pattern, text, flags=re.MULTILINE)
         if match is None:
+            home = _listed(best.robot.home[best.robot.arm_indices])
             raise RobotError(
-                f"{path} has no line like {pattern!r} to change; edit it by hand: {new}"
+                f"{path} has no line like {pattern!r} to change. {by_hand}the arm's home = {home}, joint by joint."
             )
         text = text[: match.start(1)] + new + text[match.end(1) :]
     write_whole(path, text)
 
 
-def _listed(values: Sequence[float]) -> str:
+def _listed(values: Iterable[float]) -> str:
     return f"[{', '.join(f'{value:.8g}' for value in values)}]"

@@ -28,7 +28,15 @@ from tests.command import refused, started, succeeds
 from tests.data import InOneFolder, refuses
 from tests.toy_bank import SOUP, SPAM
 from tests.toy_goals import toy_goals
-from xreset import Demos, robots, write_bank, write_demos, write_goals, write_retargeted
+from xreset import (
+    Demos,
+    read_bank,
+    robots,
+    write_bank,
+    write_demos,
+    write_goals,
+    write_retargeted,
+)
 from xreset.cli import _terminal
 from xreset.errors import FileFormatError, XResetError
 from xreset.geometry.kinematics import Kinematics
@@ -245,8 +253,12 @@ class Pictures(WithFiles):
         )
         self.assertEqual(film.read_bytes()[4:8], b"ftyp")
         self.assertIn(
-            "Frame 4 does not exist", refused("view", self.retargeted, "--out", out, "--frame 4")
+            "no frame 4: there are 4", refused("view", self.retargeted, "--out", out, "--frame 4")
         )
+        one = self.folder / "one.npz"
+        write_bank(one, read_bank(self.bank).with_states(np.array([0])))
+        for words in (("--out", out), ("--out", film), ()):
+            self.assertIn("Sequence 1 has no state", refused("view", one, "--sequence 1", *words))
         self.assertIn("Leave out the frame", refused("view", self.bank, "--out", film, "--frame 1"))
 
     def test_without_viser_the_message_says_what_to_install(self):

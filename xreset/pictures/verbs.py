@@ -81,7 +81,7 @@ def view(
         raise XResetError(
             "A film has all frames of a sequence. Leave out the frame, or end the name in .png."
         )
-    rows = shown.choose(sequence=sequence if sequence is not None or not shown.is_motion else 0)
+    rows = shown.some_rows(sequence, frame)
     if path.suffix.lower() == ".png":
         _write_png(path, shown, rows, frame, say)
     else:
@@ -114,10 +114,7 @@ def _write_png(
     from xreset.pictures.render import write_png
     from xreset.pictures.view.picture import Drawer
 
-    chosen = len(rows) // 2 if frame is None else frame
-    if not 0 <= chosen < len(rows):
-        raise XResetError(f"Frame {chosen} does not exist. Choose one from 0 to {len(rows) - 1}.")
-    row = int(rows[chosen])
+    row = int(rows[len(rows) // 2 if frame is None else frame])
     write_png(path, Drawer(shown, size=(960, 720), smooth=True).draw(row))
     say("\n".join((*shown.text(row), f"picture in {path}")))
 
@@ -132,8 +129,6 @@ def _write_mp4(
     from xreset.pictures.render import encode_mp4
     from xreset.pictures.view.picture import Drawer
 
-    if not len(rows):
-        raise XResetError("This sequence has no state to film. Choose another one with --sequence.")
     say(f"drawing {quantity(len(rows), 'frame')}")
     draw = Drawer(shown).draw
 

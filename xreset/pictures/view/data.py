@@ -108,6 +108,25 @@ class View:
             keep &= np.array(self.reason) == reason
         return np.flatnonzero(keep)
 
+    def some_rows(self, sequence: int | None, frame: int | None = None) -> np.ndarray:
+        """Return the indices of the rows of a sequence, in order; at least one.
+
+        Args:
+            sequence: None: all sequences; of a motion, the first one.
+            frame: a place among the rows that must exist.
+
+        Raises:
+            XResetError: unknown sequence or frame, or the sequence has no row.
+        """
+        if sequence is None and self.is_motion:
+            sequence = 0
+        rows = self.choose(sequence=sequence)
+        if not len(rows):
+            raise XResetError(f"Sequence {sequence} has no state. Choose another sequence.")
+        if frame is not None and not 0 <= frame < len(rows):
+            raise XResetError(f"There is no frame {frame}: there are {len(rows)}, counted from 0.")
+        return rows
+
     def text(self, row: int) -> tuple[str, ...]:
         """Return lines that describe a row, the most important one first."""
         sequence = int(self.sequence[row])

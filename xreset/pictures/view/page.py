@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from xreset.errors import XResetError
 from xreset.pictures.meshes import GOAL_COLOR, OBJECT_COLOR, Color, rgb
 from xreset.pictures.view.colors import HUMAN_COLOR, REACHED_COLOR, TOUCH_COLOR, reason_color
 from xreset.pictures.view.data import BONES, GOOD, View
@@ -44,13 +43,9 @@ class Page(WebPage):
         self.view = view
         if sequence is None and view.is_motion:
             sequence = 0
-        self._rows = view.choose(sequence=sequence)
+        self._rows = view.some_rows(sequence, frame)
         if frame is None:
-            frame = int(np.argmax(view.has_hand[self._rows])) if len(self._rows) else 0
-        if not 0 <= frame < len(self._rows):
-            raise XResetError(
-                f"There is no frame {frame}: the sequence has {len(self._rows)}, counted from 0."
-            )
+            frame = int(np.argmax(view.has_hand[self._rows]))
         self._lock = threading.RLock()
         super().__init__(host, port, "xreset view")
         self._scene = _Scene(view, self._server)

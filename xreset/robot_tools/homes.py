@@ -8,7 +8,6 @@ from itertools import product
 import numpy as np
 import torch
 
-from xreset.files.checks import frozen
 from xreset.geometry.collision import table_clearance
 from xreset.retarget.arm.model import ArmModel
 from xreset.retarget.arm.solve import reach_poses
@@ -37,29 +36,22 @@ def hold_near(robot: RobotSpec, T_world_root: np.ndarray) -> tuple[RobotSpec, st
     steps = torch.tensor(list(product(_STEPS, _STEPS, _STEPS)), dtype=torch.float64)
     steps = steps[steps.norm(dim=1).argsort(stable=True)]
     found = _held_at(robot, T_world_root, steps[:1])
-    if found is None or not found.is_free:  # the others take time
+    if found is None or not found[2]:  # the others take time
         found = _held_at(robot, T_world_root, steps)
     if found is None:
         return None
-    step = (100 * steps[found.place]).tolist()
+    held, place, _ = found
+    step = (100 * steps[place]).tolist()
     moved = f", moved by ({', '.join(f'{value:.0f}' for value in step)}) cm" if any(step) else ""
-    return found.robot, moved
+    return held, moved
 
 
-@frozen
-class _Held:
-    """A home that holds the hand at one of some places."""
-
-    robot: RobotSpec
-    place: int
-    """Index of the place."""
-    is_free: bool
-    """Whether the arm is clear of the table and of itself there."""
-
-
-def _held_at(robot: RobotSpec, T_world_root: np.ndarray, steps: torch.Tensor) -> _Held | None:
+def _held_at(
+    robot: RobotSpec, T_world_root: np.ndarray, steps: torch.Tensor
+) -> tuple[RobotSpec, int, bool] | None:
     """Return the robot with a home at the first place, of the pose [4, 4] moved by steps [S, 3], that is free; if there
-    is none, at the first place that the arm reaches."""
+    is none, at the first place that the arm reaches. Then the index of the place, and whether it is free: the arm is
+    clear of the table and of itself."""
     model = ArmModel(robot)
     root = torch.as_tensor(T_world_root).repeat(len(steps), 1, 1)
     root[:, :3, 3] += steps
@@ -74,9 +66,8 @@ def _held_at(robot: RobotSpec, T_world_root: np.ndarray, steps: torch.Tensor) ->
     for place in places:
         held = _with_arm_at(robot, model, joints[place].numpy())
         if touching_itself(held, moved_by_arm=True) <= MOST_TOUCHING:
-            return _Held(robot=held, place=int(place), is_free=len(clear) > 0)
-    held = _with_arm_at(robot, model, joints[places[0]].numpy())
-    return _Held(robot=held, place=int(places[0]), is_free=False)
+            return held, int(place), len(clear) > 0
+    return _with_arm_at(robot, model, joints[places[0]].numpy()), int(places[0]), False
 
 
 def hold_up(robot: RobotSpec) -> RobotSpec:

@@ -6,16 +6,14 @@ import numpy as np
 import torch
 import trimesh
 from numpy.testing import assert_allclose, assert_array_equal
-from PIL import Image
 
-from tests.data import InFolder
 from tests.toy_retarget import box_object
 from xreset.errors import RobotError, XResetError
 from xreset.geometry.description import load_robot as load
 from xreset.geometry.kinematics import Kinematics
 from xreset.pictures import meshes, render
 from xreset.pictures.meshes import link_colors
-from xreset.pictures.render import Camera, Points, Renderer, write_png
+from xreset.pictures.render import Camera, Points, Renderer
 from xreset.spec import SceneSpec
 
 
@@ -135,14 +133,6 @@ class Pictures(TestCase):
                     self.assertEqual(colors[link], meshes.TIP_COLOR)
             self.assertEqual(colors[Kinematics(robot).link_names[0]], meshes.ARM_COLOR)
         self.assertEqual(colors["right_index_MP"], meshes.HAND_COLOR)
-
-
-class Png(InFolder):
-    def test_written_picture_reads_back(self):
-        picture = np.random.default_rng(0).integers(0, 256, (7, 5, 3), dtype=np.uint8)
-        path = self.folder / "a.png"
-        write_png(path, picture)
-        assert_array_equal(np.asarray(Image.open(path)), picture)
 
 
 class WithoutEmbree(TestCase):

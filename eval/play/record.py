@@ -22,7 +22,7 @@ def write_film(path: str | Path, session: Session, *, seconds: float = 10.0) -> 
 
 
 def draw_film(scene: SceneSpec, moments: Sequence[Moment]) -> bytes:
-    """Draw moments as an mp4, :data:`FRAMES_PER_SECOND` of them for each second."""
+    """Draw moments as an mp4, about :data:`FRAMES_PER_SECOND` of them for each second."""
     renderer = Renderer(scene, size=SIZE)
     every = max(1, round(1.0 / (FRAMES_PER_SECOND * scene.control_dt)))
     frames = []

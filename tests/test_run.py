@@ -4,6 +4,8 @@ import shutil
 from unittest import TestCase
 from unittest.mock import patch
 
+import trimesh
+
 import xreset
 from tests.command import refused
 from tests.command import xreset as xreset_command
@@ -14,6 +16,7 @@ from xreset.demos.archive import write_demos
 from xreset.demos.verbs import synthesize
 from xreset.errors import FileFormatError, RunError
 from xreset.files.storage import file_hash
+from xreset.objects.catalogue import ALIASES
 from xreset.physics.plugins import robot_folder
 from xreset.retarget.file import read_retargeted, write_retargeted
 
@@ -54,6 +57,11 @@ class Run(InFolder, TestCase):
             self.run_it("other.npz")
         with self.assertRaisesRegex(FileFormatError, "the robot 'ur7e-sharpa', not for 'openarm'"):
             self.run_it(robot="openarm")
+        meshes = self.folder / "meshes"
+        meshes.mkdir()
+        trimesh.creation.box((0.06, 0.06, 0.1)).export(meshes / f"{ALIASES['soup']}.obj")
+        with self.assertRaisesRegex(FileFormatError, "motion.npz was made with the built-in stand"):
+            self.run_it(meshes=meshes)
         motion = self.folder / "v0.1/motion.npz"
         write_retargeted(motion, read_retargeted(motion))  # states no inputs
         with self.assertRaisesRegex(RunError, "motion.npz was made with another archive"):

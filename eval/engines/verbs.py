@@ -92,7 +92,8 @@ def compare_engines(
 
     Args:
         motion: file with the grasps: of xreset retarget, or of xreset demos, which is retargeted first.
-        engines: physics engine to measure, or several; the command's default: all that can be used here.
+        engines: physics engine to measure, or several; the command's default: all that can be used here, on a CPU
+            without MuJoCo-Warp, which is slow there.
         robot: name or folder of the robot; default: the file's.
         meshes: folder of real meshes; default: as the file names it, else the stand-ins.
         names: object to use, or several; default: all objects of the file.

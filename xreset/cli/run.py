@@ -60,7 +60,8 @@ def run(
         robot: name of a robot, or the folder of its description.
         out: run folder to make, or to continue.
         meshes: folder of real meshes; default: the built-in stand-ins.
-        engine: physics engine to evaluate in, or several; default: all that can be used here.
+        engine: physics engine to evaluate in, or several; default: all that can be used here but MuJoCo-Warp, which is
+            slow on a CPU.
         recipe: recipe of the training, or another run's folder; default: the recipe of the headline results, or that
             of the weights.
         weights: run or policy with whose networks the training starts, as in xreset train; none for new ones. Default:
@@ -81,9 +82,8 @@ def run(
     from xreset.geometry.description import load_robot
     from xreset.learning.recipes import starting_config
     from xreset.learning.verbs import ENGINE
+    from xreset.resets.inputs import load_inputs
     from xreset.resets.schedule import shared_worlds
-    from xreset.retarget.file import read_retargeted
-    from xreset.spec import check_robot
 
     demos = Path(demos)
     out = Path(out)
@@ -122,7 +122,7 @@ def run(
     with claim_folder(out):  # refused if it cannot be made, or another command writes into it
         pass
     if motion.is_file():
-        check_robot(motion, "file of motion", read_retargeted(motion), spec)
+        load_inputs(motion, robot=spec, meshes=meshes, accept=("motion",))  # refuses another
     if not _made_from(motion, demos=file_hash(demos)):
         _step("retarget", demos, robot=robot, out=motion, meshes=meshes)
     if not _made_from(bank, retargeted=file_hash(motion)):

@@ -175,6 +175,7 @@ def stress(
     from xreset.eval.rollout import chosen_engines, load_trial
 
     spec = load_policy(policy, robot=robot)
+    chosen = chosen_engines(engines, device)
     if on_robot:
         spec.exported()  # refuses a baseline
     if demos is None:
@@ -196,7 +197,7 @@ def stress(
     return experiment.play(
         spec,
         trial,
-        chosen_engines(engines, device),
+        chosen,
         conditions,
         Path(out) if out else default,
         episodes=episodes,

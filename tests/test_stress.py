@@ -146,6 +146,11 @@ class CurveTest(TestCase):
 
 
 class CommandTest(InFolder):
+    def test_an_unknown_engine_is_refused_before_demonstrations_are_made(self):
+        with patch("xreset.demos.verbs.synthesize") as made:
+            self.assertIn("Unknown engine", refused("stress openarm --engine none"))
+        made.assert_not_called()
+
     def test_a_sweep_from_the_command_line(self):
         """A hand that does nothing, one demonstration and one value; and an engine that cannot set drives."""
         from xreset.backends.mujoco import MujocoBackend

@@ -281,7 +281,7 @@ def run_study(
         study: study file, or name of a study that ships with xreset.
         data: folder with the study's demonstrations and meshes.
         out: folder for all output.
-        runs: only this run of the study, or several; default: all.
+        runs: only this run of the study, or several; default: all. The page has all runs.
         only: kind of steps to run: reset banks, trainings, evaluations or tables.
         dry_run: print the plan and its commands, and run nothing.
         say: called with a line before each command, and with the lines of the plan.
@@ -295,12 +295,12 @@ def run_study(
 
     path = study_path(str(study))
 
-    def planned() -> plan.Plan:
+    def planned(chosen: Sequence[str] = ()) -> plan.Plan:
         return plan.make_plan(
-            read_study(path), path.stem, given=Path(data), out=Path(out), only=texts(runs)
+            read_study(path), path.stem, given=Path(data), out=Path(out), only=chosen
         )
 
-    todo = planned()
+    todo = planned(texts(runs))
     wanted = [step for step in todo.steps.values() if only in ("all", step.kind)]
     if dry_run:
         for step in wanted:

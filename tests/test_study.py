@@ -368,6 +368,13 @@ class TablesTest(Studied):
         (soup,) = [x for x in lines if x.startswith(f"ours-seed1,mujoco,{SOUP},task_progress,")]
         self.assertEqual(float(soup.split(",")[4]), 0.66)
 
+    def test_the_page_has_all_runs_whichever_is_taken(self):
+        self.write("ours-seed0", 1.0, 1.0, 0.33, 0.33)
+        self.write("ik", 0.33, 0.33, 0.33, 0.33)
+        words = ("--out", self.out, "--only tables --run ik")
+        succeeds("study", self.file(self.TEXT), *words)
+        self.assertIn("ours", (self.out / "reports" / "study" / "results.csv").read_text())
+
     def test_the_unit_is_that_of_the_metric(self):
         self.write("ours-seed0", 1.0, 1.0, 0.33, 0.33)
         lengths = "[[tables]]\nmetric = 'least_distance'\nruns = { ours = 'A' }\n"

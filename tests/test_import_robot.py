@@ -10,6 +10,7 @@ from pathlib import Path
 from unittest import SkipTest, TestCase, mock
 
 import numpy as np
+import trimesh
 from numpy.testing import assert_allclose
 from torch import tensor
 
@@ -21,13 +22,15 @@ from xreset import load_object, load_robot, make_backend
 from xreset.errors import BackendUnavailableError, RobotError, XResetError
 from xreset.geometry.collision import table_clearance
 from xreset.geometry.kinematics import Kinematics
+from xreset.geometry.shapes import surface_of
 from xreset.geometry.urdf import load_urdf
 from xreset.robot_tools import check as checks
 from xreset.robot_tools import homes
 from xreset.robot_tools.check import check
 from xreset.robot_tools.draft import hand_side
+from xreset.robot_tools.fingers import _stated_finger
 from xreset.robot_tools.importer import make_robot
-from xreset.robot_tools.sources import bare, completed, read_source
+from xreset.robot_tools.sources import bare, completed, read_source, renamed
 from xreset.spec import SceneSpec, TableSpec
 
 ARCHIVES = DEFAULT.parent / "robots"
@@ -156,20 +159,21 @@ class Toy(Robots):
         )
 
     def test_fingers_opposite_a_thumb_in_the_middle_are_those_of_a_right_hand(self):
-        for y in (-0.001, 0.0, 0.001):
+        for y, thumb in ((-0.001, "thumb"), (0.0, "f_middle"), (0.001, "thumb")):
             places = {
                 "f2": ((0.085, -0.03, 0), "0 0 0"),
                 "thumb": ((0.085, y, -0.06), "3.1416 0 0"),
             }
             with self.subTest(y=y), mock.patch.dict(_PLACES, places):
-                hand = _hand(*map(_finger, ("f1", "f2", "thumb")))
+                hand = _hand(*map(_finger, ("f1", "f2", "thumb"))).replace("thumb", thumb)
                 made = make_robot(
                     self.arm, self.file("hand.urdf", hand), self.folder / f"mine{1e3 * y:g}"
                 )
                 tips = {
                     tip.name: tip.contact_links[0] for tip in load_robot(made.folder).fingertips
                 }
-                self.assertEqual(tips, {"thumb": "thumb_b", "index": "f1_b", "middle": "f2_b"})
+                links = {"thumb": f"{thumb}_b", "index": "f1_b", "middle": "f2_b"}
+                self.assertEqual(tips, links)
                 self.assertIn(
                     "fingers are named as in a right hand: index is f1_b; middle is f2_b",
                     made.guessed,
@@ -223,11 +227,26 @@ class Toy(Robots):
         expected = "thumb rh_THmiddle index rh_FFmiddle middle rh_MFmiddle little rh_LFmiddle"
         self.assertEqual(" ".join(links), expected)
 
+    def test_what_names_say_of_a_finger(self):
+        for names, finger in (
+            ("RThumb1_link", "thumb"),
+            ("l_lindex_tip", "index"),
+            ("LEFT_RING_2", "ring"),
+            ("spring_1 bearing", ""),
+            ("rh_LFJ4", "little"),
+            ("rf_mount", ""),
+        ):
+            self.assertEqual(_stated_finger(names), finger, names)
+
     def test_a_coupled_joint_has_the_limits_that_its_source_gives_it(self):
         folder = self.imported(
             HAND.replace('upper="1.5" effort="1" velocity="5"/>\n  <mimic', 'upper="1"/><mimic')
         )
         joint = load_urdf(f"{folder}/robot.urdf").joint("f1_2")
+        assert_allclose((joint.lower, joint.upper), (0.1, 1.3))
+        unset = HAND.replace('upper="1.5" effort="1" velocity="5"/>\n  <mimic', 'upper="0"/><mimic')
+        joint = self.read("hand.urdf", unset)[0].joint("f1_2")
+        self.assertEqual(joint.type, "revolute")
         assert_allclose((joint.lower, joint.upper), (0.1, 1.3))
         self.assertIn("'f1_2' has the limits 0.1..1.3", (folder / "robot.toml").read_text())
         text = (folder / "robot.urdf").read_text()
@@ -313,6 +332,19 @@ class Toy(Robots):
             assert_allclose((a.lower, a.upper), (b.lower, b.upper), atol=1e-9)
             assert_allclose(a.T_parent_joint, b.T_parent_joint, atol=1e-9)
 
+    def test_a_mirrored_mesh_of_an_mjcf_is_where_mujoco_has_it(self):
+        palm = trimesh.creation.box((0.08, 0.06, 0.02))
+        palm.apply_translation((0.01, 0.02, 0.03))
+        palm.export(self.folder / "palm.stl")
+        asset = '<asset><mesh name="palm" file="palm.stl" scale="1 -1 1"/></asset><worldbody>'
+        text = MJCF.replace("<worldbody>", asset).replace(
+            'type="box" pos="0.04 0 0" size="0.04 0.04 0.01"',
+            'type="mesh" mesh="palm" pos="0.04 0 0"',
+        )
+        vertices, _ = surface_of(self.read("hand.xml", text)[0].link("base").collisions)
+        assert_allclose(vertices.min(axis=0), (0.01, -0.05, 0.02), atol=1e-6)
+        assert_allclose(vertices.max(axis=0), (0.09, 0.01, 0.04), atol=1e-6)
+
     def test_what_mjcf_has_and_robots_do_not_is_named_one_by_one(self):
         ball = MJCF
         for old, new in (
@@ -359,6 +391,14 @@ class Toy(Robots):
         pulling = '<motor joint="f1_1" ctrlrange="-9 0"/></actuator>'
         text = MJCF.replace("</actuator>", pulling)
         self.assertEqual(self.read("pulling.xml", text)[0].joint("f1_1").effort, 9.0)
+
+    def test_bodies_and_joints_without_a_name_get_one_that_makers_do_not_use(self):
+        text = MJCF.replace('body name="f1_a"', "body").replace('"f2_a"', '"body2"')
+        text = re.sub("<equality>.*</actuator>", "", text, flags=re.DOTALL)
+        text = text.replace('joint name="f1_1"', "joint").replace('"f2_1"', '"joint0"')
+        tree, _ = self.read("hand.xml", text)
+        moved = {link: tree.moved_by[link].name for link in ("unnamed_body2", "body2")}
+        self.assertEqual(moved, {"unnamed_body2": "unnamed_joint0", "body2": "joint0"})
 
     def test_an_actuator_of_a_floating_base_is_left_out(self):
         text = MJCF.replace('<body name="base">', '<body name="base"><freejoint name="float"/>', 1)
@@ -541,6 +581,9 @@ class Toy(Robots):
         )
         self.assertEqual(self.read("named.urdf", prefixed)[0].name, "named")
         shown = HAND.replace("collision>", "visual>")
+        capsule = '<capsule radius=" 0.007 " length="0.02"/>'
+        tree, _ = self.read("spaces.urdf", HAND.replace('<box size="0.036 0.014 0.014"/>', capsule))
+        self.assertEqual(tree.link("f1_a").collisions[0].geometry.size, (0.007, 0.01))
         tree, notes = self.read("shown.urdf", shown)
         self.assertTrue(tree.link("f1_b").collisions)
         self.assertIn("visual shapes collide where there is no other: base, f1_a, f1_b", notes)
@@ -602,7 +645,11 @@ class Toy(Robots):
         both = self.two_hands(0.4)
         words = "has 2 hands, with the fingers left_f1_b, .*; right_f1_b, .*Choose one with --thumb"
         self.assertRaisesRegex(RobotError, words, self.imported, both)
+        trimesh.creation.box((0.08, 0.08, 0.02)).export(self.folder / "palm.stl")
+        both = both.replace('<box size="0.08 0.08 0.02"/>', '<mesh filename="palm.stl"/>')
         spec = load_robot(self.imported(both, thumb="right_thumb_a"))
+        meshes = [file.name for file in (self.folder / "mine" / "meshes").iterdir()]
+        self.assertEqual(meshes, ["right_base_0.obj"], "none of the other hand")
         self.assertEqual(spec.hand_root, "right_base")
         self.assertEqual(len(spec.hand_indices), 4)
         self.assertFalse([name for name in load_urdf(spec.urdf).link_names if "left" in name])
@@ -618,6 +665,15 @@ class Toy(Robots):
         words = "ends in claw, thumb. Name the link that carries the hand with --flange"
         self.assertRaisesRegex(RobotError, words, self.imported, HAND, two)
         self.assertRaisesRegex(RobotError, "no link 'wrist'", self.imported, HAND, flange="wrist")
+        words = "no joint moves the link 'base', which would carry the hand. Name another"
+        self.assertRaisesRegex(RobotError, words, self.imported, HAND, flange="base")
+
+    def test_no_name_of_the_hand_is_one_of_the_arm(self):
+        arm, _ = self.read("arm.urdf", ARM)
+        hand, _ = self.read("hand.urdf", HAND.replace('"f1_a"', '"hand_base"'))
+        names = renamed(hand, arm).link_names
+        self.assertEqual(names[0], "hand_hand_base", "both roots are called base")
+        self.assertEqual(len({*names, *arm.link_names}), len(names) + len(arm.link_names))
 
     def test_the_arm_of_a_robot_carries_another_hand(self):
         again = load_robot(self.imported(HAND, arm=self.sources / "mine"))

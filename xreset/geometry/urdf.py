@@ -376,7 +376,7 @@ def _parsed(xml: Element) -> yourdfpy.Robot:
             raise RobotError(f"a {shown(shape.tag)} has a negative radius.")
         if shape.tag == "capsule":
             shape.tag = "cylinder"
-            shape.set("radius", f"-{shape.get('radius')}")
+            shape.set("radius", f"-{shape.get('radius', '').strip()}")
     for kind in ("link", "joint"):
         for part in xml.iterfind(kind):
             if part.get("name") is None:
@@ -623,7 +623,8 @@ def _joint(joint: yourdfpy.Joint) -> Joint:
     kind = joint.type
     if kind not in ("revolute", "continuous", "prismatic", "fixed"):
         raise RobotError(
-            f"joint {name!r} has type {kind!r}; supported are revolute, continuous, prismatic and fixed."
+            f"joint {name!r} has type {kind!r}, expected revolute, continuous, prismatic or fixed. Make it fixed, or "
+            "replace it by joints of these types."
         )
     axis = np.asarray(joint.axis, dtype=float)
     if axis.shape != (3,):

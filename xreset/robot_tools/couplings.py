@@ -47,7 +47,7 @@ class Line(NamedTuple):
 
 def joint_name(model: mujoco.MjModel, joint: int) -> str:
     """Return the name of a joint, or one made from its number."""
-    return model.joint(joint).name or f"joint{joint}"
+    return model.joint(joint).name or f"unnamed_joint{joint}"
 
 
 class Couplings:

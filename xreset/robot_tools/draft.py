@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -43,6 +44,7 @@ def draft_spec(
 ) -> RobotSpec:
     """Write the URDF, and return the robot as far as it is known; at home, joints are at 0, and bent from there."""
     (folder / "robot.urdf").write_text(urdf_text(tree, "Written by xreset robots import."))
+    shutil.rmtree(folder / "meshes", ignore_errors=True)  # of links that a draft before had
     write_meshes(tree, folder)
     inside = set(tree.below(hand_root)[1:])
     joints = []

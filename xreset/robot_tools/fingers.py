@@ -31,8 +31,9 @@ _NAMES = {
     "little": ("little|pink", "lf"),
     "middle": ("middle", "mf"),
 }
-"""What words in the names of a finger's links and joints begin with, and the codes in names such as ``rh_FFdistal`` and
-``THJ5``, as the Shadow hand has them; "middle" may also be a bone, so it comes last."""
+"""What words in the names of a finger's links and joints begin with, after a letter for the side or none, and the codes
+in names such as ``rh_FFdistal`` and ``THJ5``, as the Shadow hand has them; "middle" may also be a bone, or be between
+two others, so it comes last."""
 _BONE = r"(?=_?(j\d|base|hub|knuckle|meta|prox|mid|dist|tip))"
 _HUMAN = (0.0, 0.45, 0.73)
 """Positions of a human finger's joints between its first one and its tip: knuckle, middle joint, last joint (rounded
@@ -350,8 +351,9 @@ class Hand:
                 f"no finger can oppose the others. Name a link of the thumb with --thumb: {known}."
             )
         points = scores / scores.max() + _beside_others(chains) + _first_of_five(chains)
+        named = {one.name for one in chains} - {"", "middle"}
         for i, one in enumerate(chains):
-            if unnamed and one.name:
+            if unnamed and named and one.name:
                 points[i] = 0.0
         second, first = points.argsort()[-2:]
         note = f"the thumb is the finger of {links[first]}: it can oppose the others, beside which it begins"
@@ -587,11 +589,11 @@ def _beside_others(chains: list[Finger]) -> np.ndarray:
 
 
 def _first_of_five(chains: list[Finger]) -> np.ndarray:
-    """[F] 1 for the first finger of a hand of five whose names count the fingers from 1 on."""
+    """[F] 1 for the first finger of a hand of five whose names count the fingers from 0 or 1 on."""
     texts = [re.split(r"(\d+)", one.links[-1]) for one in chains]
     for parts in zip(*texts, strict=False):
-        if set(parts) == set("12345"):
-            return np.array([float(part == "1") for part in parts])
+        if set(parts) in (set("01234"), set("12345")):
+            return np.array([float(part == min(parts)) for part in parts])
     return np.zeros(len(chains))
 
 
@@ -615,7 +617,7 @@ def _stated_finger(names: str) -> str:
     """Return the finger that the names of links and joints state, or an empty text."""
     text = re.sub("(?<=[a-z])(?=[A-Z][a-z])", "_", names).lower()  # leftThumb
     for finger, (words, code) in _NAMES.items():
-        if re.search(rf"(?<![a-z])({words}|{code}{_BONE})", text):
+        if re.search(rf"(?<![a-z])([lr]?({words})|{code}{_BONE})", text):
             return finger
     return ""
 

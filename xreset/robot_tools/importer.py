@@ -208,6 +208,10 @@ def _read_arm(path: Path, flange: str | None, notes: list[str]) -> _Arm:
         flange = last_link(tree, None if robot is None else robot.hand_root)
         notes.append(f"the hand is carried by the arm's link {flange!r} (--flange chooses another)")
     arm = bare(tree, tree.link(flange).name, notes)
+    if not arm.moved_by:
+        raise RobotError(
+            f"{path}: no joint moves the link {flange!r}, which would carry the hand. Name another one with --flange."
+        )
     ahead = _out_of_flange(arm, flange)
     if robot is not None and robot.palm in tree.below(flange):
         fingers = tree.pose_in(flange, robot.palm)[:3, 0]
@@ -442,6 +446,7 @@ def _with_drives(spec: RobotSpec, tree: RobotTree, notes: list[str]) -> RobotSpe
             f"with less stiffness than stated, which is too much for the step of the engines: {listed(softer)}"
         )
     notes.append(
-        "drives: kd = 1.8 sqrt(kp I) in the hand, critical in the arm, with the inertia I about the joint at home"
+        "drives: kd = 1.8 sqrt(kp I) in the hand, critical in the arm, with the inertia I about the joint at home; "
+        "stiffness and armature of the arm are guessed, also where an MJCF states them"
     )
     return replace(spec, joints=tuple(joints))

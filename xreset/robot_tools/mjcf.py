@@ -265,7 +265,7 @@ def _solid(model: mujoco.MjModel, notes: list[str]) -> np.ndarray:
     visual = on_robot & ~np.isin(body, body[solid])
     solid |= visual
     for what, used in (("shapes of collision groups", groups), ("visual shapes", visual)):
-        bodies = [model.body(i).name or f"body{i}" for i in np.unique(model.geom_bodyid[used])]
+        bodies = [_body_name(model, i) for i in np.unique(model.geom_bodyid[used]).tolist()]
         if bodies:
             notes.append(f"{what} collide where no contact is switched on: {listed(bodies)}")
     return solid
@@ -283,7 +283,7 @@ def _tree(
 
     The origin of a link is at its joint, which may be away from the body's origin.
     """
-    names = [model.body(i).name or f"body{i}" for i in range(model.nbody)]
+    names = [_body_name(model, i) for i in range(model.nbody)]
     kept = _kept_trees(path, model, names, notes)
     if len(kept) > 1 or _moving(model, kept[0]):
         names[0] = "world_frame"
@@ -330,6 +330,10 @@ def _tree(
         joints=tuple(joints),
         exclude=tuple(pair for pair in pairs if {*pair} <= {*order}),
     )
+
+
+def _body_name(model: mujoco.MjModel, body: int) -> str:
+    return model.body(body).name or f"unnamed_body{body}"
 
 
 def _kept_trees(

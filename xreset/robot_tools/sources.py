@@ -225,32 +225,37 @@ def with_fixed(tree: RobotTree, names: Sequence[str]) -> RobotTree:
 
 def renamed(hand: RobotTree, arm: RobotTree) -> RobotTree:
     """Return a hand with ``hand_`` before the names of links and joints that the arm has too."""
-    arm_joints = {joint.name for joint in arm.joints}
-
-    def link_name(name: str) -> str:
-        return f"hand_{name}" if name in arm.link_names else name
-
-    def joint_name(name: str) -> str:
-        return f"hand_{name}" if name in arm_joints else name
-
+    link_names = _unlike(hand.link_names, arm.link_names)
+    joint_names = _unlike(
+        [joint.name for joint in hand.joints], [joint.name for joint in arm.joints]
+    )
     joints = []
     for joint in hand.joints:
-        name = joint_name(joint.name)
+        name = joint_names[joint.name]
         mimic = joint.mimic
         if mimic is not None:
-            mimic = replace(mimic, joint=name, source=joint_name(mimic.source))
-        parent = link_name(joint.parent)
-        child = link_name(joint.child)
+            mimic = replace(mimic, joint=name, source=joint_names[mimic.source])
+        parent = link_names[joint.parent]
+        child = link_names[joint.child]
         joints.append(replace(joint, name=name, parent=parent, child=child, mimic=mimic))
-    links = [replace(link, name=link_name(link.name)) for link in hand.links]
-    exclude = [(link_name(a), link_name(b)) for a, b in hand.exclude]
+    links = [replace(link, name=link_names[link.name]) for link in hand.links]
+    exclude = [(link_names[a], link_names[b]) for a, b in hand.exclude]
     return replace(
         hand,
-        root=link_name(hand.root),
+        root=link_names[hand.root],
         links=tuple(links),
         joints=tuple(joints),
         exclude=tuple(exclude),
     )
+
+
+def _unlike(names: Sequence[str], others: Sequence[str]) -> dict[str, str]:
+    """Return name -> the same name, or one with a prefix that is in neither sequence where the others have it too."""
+    prefix = "hand_"
+    shared = set(names) & set(others)
+    while any(f"{prefix}{name}" in {*names, *others} for name in shared):
+        prefix += "hand_"
+    return {name: f"{prefix}{name}" if name in shared else name for name in names}
 
 
 def combined(arm: RobotTree, hand: RobotTree, flange: str, T_flange_hand: np.ndarray) -> RobotTree:
@@ -265,7 +270,8 @@ def combined(arm: RobotTree, hand: RobotTree, flange: str, T_flange_hand: np.nda
 
 
 def _with_ranges(tree: RobotTree, path: str | Path, notes: list[str]) -> RobotTree:
-    """Return the tree with finite limits that joints can have; a joint without a range is fixed."""
+    """Return the tree with finite limits that joints can have; a joint without a range is fixed, unless it follows
+    another."""
     units = {}
     for kind, (name, unit, most) in _UNITS.items():
         moving = [joint for joint in tree.moved_by.values() if joint.type == kind]
@@ -278,8 +284,8 @@ def _with_ranges(tree: RobotTree, path: str | Path, notes: list[str]) -> RobotTr
             notes.append(f"limits of joints, up to {max(far):g}, are read as {name}")
         elif kind == "revolute" and len(stated) > 1 and max(stated) < _LEAST_TURN:
             raise RobotError(
-                f"{path}: no joint turns by more than {max(stated):.2g} rad. Are the limits in other units? A URDF "
-                'states radians; an MJCF states degrees, or <compiler angle="radian"/>.'
+                f"{path}: no joint turns by more than {max(stated):.2g} rad. Are the limits missing, or in other "
+                'units? A URDF states radians; an MJCF states degrees, or <compiler angle="radian"/>.'
             )
     joints = []
     fixed = []
@@ -291,9 +297,9 @@ def _with_ranges(tree: RobotTree, path: str | Path, notes: list[str]) -> RobotTr
             far = _TURNS if joint.type == "revolute" else _SLIDE
             unlimited.append(joint.name)
             joint = replace(joint, lower=-far, upper=far)
-        elif joint.upper - joint.lower < _LEAST_RANGE:
+        elif joint.upper - joint.lower < _LEAST_RANGE and joint.mimic is None:
             fixed.append(joint.name)
-            joint = replace(_at(joint, joint.lower), type="fixed", mimic=None)
+            joint = replace(_at(joint, joint.lower), type="fixed")
         joints.append(joint)
     if unlimited:
         notes.append(

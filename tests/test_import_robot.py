@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from unittest import SkipTest, TestCase, mock
 
+import mujoco
 import numpy as np
 import trimesh
 from numpy.testing import assert_allclose
@@ -22,7 +23,7 @@ from xreset import load_object, load_robot, make_backend
 from xreset.errors import BackendUnavailableError, RobotError, XResetError
 from xreset.geometry.collision import table_clearance
 from xreset.geometry.kinematics import Kinematics
-from xreset.geometry.shapes import surface_of
+from xreset.geometry.shapes import surface_of, transform
 from xreset.geometry.urdf import load_urdf
 from xreset.robot_tools import check as checks
 from xreset.robot_tools import homes
@@ -30,7 +31,7 @@ from xreset.robot_tools.check import check
 from xreset.robot_tools.draft import hand_side
 from xreset.robot_tools.fingers import _stated_finger
 from xreset.robot_tools.importer import make_robot
-from xreset.robot_tools.sources import bare, completed, read_source, renamed
+from xreset.robot_tools.sources import _at, bare, completed, grounded, read_source, renamed
 from xreset.spec import SceneSpec, TableSpec
 
 ARCHIVES = DEFAULT.parent / "robots"
@@ -183,6 +184,10 @@ class Toy(Robots):
         hand, palm = at_home(self.spec, "hand_base", "palm_frame")
         in_hand = np.linalg.inv(hand) @ palm
         assert_allclose(in_hand[:3, :3], np.diag((1, -1, -1)), atol=0.06)
+        assert_allclose(in_hand[:3, 3], (0.045, 0, 0), atol=5e-3, err_msg="4 cm behind knuckles")
+        straight = Kinematics(self.spec).link_poses(0 * tensor(self.spec.home)).numpy()
+        frames = [Kinematics(self.spec).link_index(x) for x in ("palm_frame", "thumb_tip_frame")]
+        assert_allclose(*straight[frames, :3, :3], atol=1e-6)
         # at home it looks down at the table
         assert_allclose(palm[:3, 2], (0, 0, -1), atol=0.05)
         self.assertEqual(hand_side(self.spec), "right")
@@ -245,9 +250,11 @@ class Toy(Robots):
         joint = load_urdf(f"{folder}/robot.urdf").joint("f1_2")
         assert_allclose((joint.lower, joint.upper), (0.1, 1.3))
         unset = HAND.replace('upper="1.5" effort="1" velocity="5"/>\n  <mimic', 'upper="0"/><mimic')
-        joint = self.read("hand.urdf", unset)[0].joint("f1_2")
-        self.assertEqual(joint.type, "revolute")
-        assert_allclose((joint.lower, joint.upper), (0.1, 1.3))
+        against = HAND.replace('multiplier="0.8"', 'multiplier="-0.8"')
+        for text, limits in ((unset, (0.1, 1.3)), (against, (-1.1, 0.1))):
+            joint = self.read("hand.urdf", text)[0].joint("f1_2")
+            self.assertEqual(joint.type, "revolute")
+            assert_allclose((joint.lower, joint.upper), limits)
         self.assertIn("'f1_2' has the limits 0.1..1.3", (folder / "robot.toml").read_text())
         text = (folder / "robot.urdf").read_text()
         (folder / "robot.urdf").write_text(text.replace('upper="1.3"', 'upper="1"'))
@@ -318,10 +325,8 @@ class Toy(Robots):
         urdf = completed(read_source(self.hand, []), self.hand, [])
         self.assertEqual((mjcf.link_names, mjcf.mimics), (urdf.link_names, urdf.mimics))
         for a, b in zip((*mjcf.joints, *mjcf.links), (*urdf.joints, *urdf.links), strict=True):
-            for name in ("name", "type", "lower", "upper"):
+            for name in ("name", "type", "lower", "upper", "mass"):
                 self.assertEqual(getattr(a, name, None), getattr(b, name, None))
-            for name in ("T_parent_joint", "mass", "com", "inertia"):
-                assert_allclose(getattr(a, name, 0), getattr(b, name, 0), atol=1e-6)
         for a, b in zip(*(tree.link("f1_b").collisions for tree in (mjcf, urdf)), strict=True):
             self.assertEqual(a.geometry.size, b.geometry.size)
         drives = [(joint.stiffness, joint.effort) for joint in mjcf.joints[:2]]
@@ -331,6 +336,40 @@ class Toy(Robots):
         for a, b in zip(mjcf.joints, unstated.joints, strict=True):
             assert_allclose((a.lower, a.upper), (b.lower, b.upper), atol=1e-9)
             assert_allclose(a.T_parent_joint, b.T_parent_joint, atol=1e-9)
+
+    def test_links_of_an_mjcf_move_as_in_mujoco(self):
+        """Joints next to their bodies' origins, two of one body, one that is not at 0 in the file, one that is held."""
+        text = """<mujoco><compiler angle="radian"/><worldbody>
+          <body name="base" pos="0.1 0.2 0.3" euler="0.4 0 0"><geom size="0.05"/>
+          <body name="a" pos="0 0.1 0.05" euler="0.3 0.5 0"><geom size="0.02"/>
+            <inertial pos="0.02 0 0.01" mass="0.1" diaginertia="1e-5 2e-5 2.5e-5" euler="0.2 0.1 0.7"/>
+            <joint name="turn" axis="0 1 1" pos="0.01 0.02 0" ref="0.3" range="-1 1"/>
+            <joint name="slide" type="slide" axis="1 0 2" range="-0.1 0.1"/>
+          <body name="b" pos="0.05 0 0" euler="0 0.2 0"><geom type="box" size="0.02 0.01 0.03" pos="0.01 0 0"/>
+            <joint name="held" axis="1 0 0" range="-1 1"/>
+          <body name="c" pos="0.04 0 0"><geom type="capsule" size="0.01 0.02" euler="0.3 0 0" pos="0 0 0.02"/>
+            <joint name="end" axis="0 0 1" range="-1 1"/></body></body></body></body></worldbody>
+          <equality><joint joint1="held" polycoef="0.4 0 0 0 0"/></equality></mujoco>"""
+        tree = read_source(self.file("chain.xml", text), [])
+        model = mujoco.MjModel.from_xml_string(text)
+        data = mujoco.MjData(model)
+        positions = {"turn": 0.7, "slide": 0.05, "held": 0.4, "end": -0.6}
+        for name, position in positions.items():
+            data.joint(name).qpos = position
+        mujoco.mj_kinematics(model, data)
+        poses = {"base": transform(data.body("base").xmat.reshape(3, 3), data.body("base").xpos)}
+        for joint in tree.joints:
+            position = 0.0 if joint.type == "fixed" else positions[joint.name]
+            poses[joint.child] = poses[joint.parent] @ _at(joint, position).T_parent_joint
+        for link in tree.links:
+            if link.collisions:
+                body = data.body(link.name)
+                R = poses[link.name][:3, :3]
+                assert_allclose(poses[link.name][:3, 3] + R @ link.com, body.xipos, atol=1e-9)
+                moments = np.diag(model.body(link.name).inertia)
+                inertial = body.ximat.reshape(3, 3)
+                inertia = inertial @ moments @ inertial.T
+                assert_allclose(R @ link.inertia @ R.T, inertia, atol=1e-12)
 
     def test_a_mirrored_mesh_of_an_mjcf_is_where_mujoco_has_it(self):
         palm = trimesh.creation.box((0.08, 0.06, 0.02))
@@ -414,6 +453,7 @@ class Toy(Robots):
         self.assertAlmostEqual(mimic.offset, 0.15)
         still = self.read("still.urdf", chain.replace('multiplier="0.5"', 'multiplier="0"'))[0]
         self.assertEqual(still.joint("f2_2").type, "fixed")
+        self.assertAlmostEqual(still.joint("f2_2").T_parent_joint[0, 2], np.sin(0.1))
         with self.assertRaisesRegex(RobotError, "follow one another in a circle: f1_2. Let"):
             self.read("circle.urdf", HAND.replace('<mimic joint="f1_1"', '<mimic joint="f1_2"'))
 
@@ -516,14 +556,38 @@ class Toy(Robots):
         self.assertFalse([name for name in load_urdf(spec.urdf).link_names if "pen" in name])
         self.assertIn(("f1_a", "f2_a"), spec.collision_exclude)
 
+    def test_three_joints_before_any_shape_let_a_hand_float_and_two_are_a_wrist(self):
+        for count in (2, 3):
+            parts = ""
+            for i in range(count):
+                ends = f'<parent link="w{i}"/><child link="{"base" if i == count - 1 else f"w{i + 1}"}"/>'
+                parts += (
+                    f'<link name="w{i}"/><joint name="w{i}" type="revolute">{ends}{_LIMIT}</joint>'
+                )
+            tree, _ = self.read("hand.urdf", HAND.replace("</robot>", f"{parts}</robot>"))
+            moving = [joint.name for joint in grounded(tree, []).moved_by.values()]
+            self.assertEqual("w0" in moving, count == 2)
+
     def test_numbers_that_no_robot_has(self):
         fixed = re.sub(
             r'<mimic joint="f1_1"[^>]*>', "", HAND
         )  # what follows it would be fixed, too
+        slides = HAND.replace("revolute", "prismatic")
         for text, words, field, value in (
             (HAND.replace('value="0.05"', 'value="30"'), "size does not allow.*f1_a", "lower", 0),
             (HAND.replace('value="0.05"', 'value="1e-6"'), "size does not allow.*f1_a", "lower", 0),
-            (fixed.replace('upper="1.5"', 'upper="0"', 1), "fixed, .*: f1_1", "type", "fixed"),
+            (
+                fixed.replace('lower="0" upper="1.5"', 'lower="1" upper="1"', 1),
+                "fixed, .*: f1_1",
+                "type",
+                "fixed",
+            ),
+            (
+                slides.replace('upper="1.5"', 'upper="40"'),
+                "40, are read as millimetres",
+                "upper",
+                0.04,
+            ),
             (HAND.replace('upper="1.5"', 'upper="86"'), "86, are read as degrees", "upper", 1.501),
             (HAND.replace('upper="1.5"', 'upper="1e4"', 1), "limits .* have: f1_1", "upper", 6.283),
             (HAND.replace('velocity="5"', 'velocity="1e5"'), "a speed that a", "velocity", 3.142),
@@ -534,6 +598,8 @@ class Toy(Robots):
                 found = getattr(tree.above["f1_a"], field)
                 self.assertEqual(found if isinstance(found, str) else round(found, 3), value)
                 self.assertLess(tree.link("f1_a").mass, 0.1)
+        still = self.read("hand.urdf", fixed.replace('"0" upper="1.5"', '"1" upper="1"', 1))[0]
+        self.assertAlmostEqual(still.above["f1_a"].T_parent_joint[0, 2], np.sin(1.0))
         weak = self.file("weak.urdf", ARM.replace('effort="60"', 'effort="1"'))
         text = MJCF.replace('name="f1_1"', 'name="f1_1" armature="1"', 1).replace(
             'kp="3"', 'kp="900"'
@@ -642,6 +708,7 @@ class Toy(Robots):
         words = "has 2 hands, with the fingers left_f1_b, .*Choose one with --thumb"
         nameless = self.two_hands(0.08, joints=3, thumb="f4")
         self.assertRaisesRegex(RobotError, words, self.imported, nameless)
+        self.assertRaisesRegex(RobotError, words, self.imported, self.two_hands(0.4, thumb="f4"))
         both = self.two_hands(0.4)
         words = "has 2 hands, with the fingers left_f1_b, .*; right_f1_b, .*Choose one with --thumb"
         self.assertRaisesRegex(RobotError, words, self.imported, both)
@@ -709,12 +776,18 @@ class Toy(Robots):
         self.assertIn("135 mm along the flange's z axis", " ".join(made.guessed))
 
     def test_fingers_point_out_of_the_arm_whichever_axis_of_the_flange_does(self):
-        for rpy, axis in (("-1.5708 0 0", "-y"), ("0.7 0.7 0", "z")):
+        before, last, after = ARM.rpartition('<axis xyz="0 0 1"/>')
+        against = before + last.replace("0 0 1", "0 0 -1") + after
+        for text, rpy, axis in (
+            (ARM, "-1.5708 0 0", "-y"),
+            (ARM, "0.7 0.7 0", "z"),
+            (against, "1.5708 0 0", "y"),
+        ):
             mount = (
                 f'<link name="tool0"/><joint name="mount" type="fixed"><origin xyz="0 0 0.02" rpy="{rpy}"/>'
                 '<parent link="l5"/><child link="tool0"/></joint></robot>'
             )
-            arm = self.file("turned.urdf", ARM.replace("</robot>", mount))
+            arm = self.file("turned.urdf", text.replace("</robot>", mount))
             made = make_robot(arm, self.hand, self.folder / f"mine{axis}")
             spec = load_robot(made.folder)
             palm, last = Kinematics(spec).link_poses(tensor(spec.home), ["palm_frame", "l5"])
@@ -780,8 +853,12 @@ class Toy(Robots):
             f'<link name="{x}"/><joint name="mark" type="fixed"><parent link="base"/><child link="{x}"/></joint>'
             for x in ("a", "b")
         ]
-        folder = self.imported(HAND.replace("</robot>", f"{''.join(frames)}</robot>"))
+        tip = frames[0].replace('"a"', '"f1_tip"').replace('"base"/>', '"f1_b"/>')
+        tip = tip.replace("</joint>", '<origin xyz="0.05 0.01 0"/></joint>')
+        folder = self.imported(HAND.replace("</robot>", f"{''.join(frames)}{tip}</robot>"))
         self.assertLess({"a", "b"}, {*load_urdf(folder / "robot.urdf").link_names})
+        named, tip = at_home(load_robot(folder), "f1_tip", "index_tip_frame")
+        assert_allclose(tip[:3, 3], named[:3, 3], atol=1e-9, err_msg="where its name is")
 
     def test_a_jaw_that_is_closed_at_0_in_one_file_with_its_arm(self):
         described = load_robot("openarm")
@@ -869,8 +946,9 @@ class Toy(Robots):
         heavy = HAND.replace(
             'ixx="1e-5" iyy="1e-5" izz="1e-5"', 'ixx="0.1" iyy="0.1" izz="0.1"', 1
         ).replace('<mass value="0.4"/>', '<mass value="0"/>')
+        heavy = heavy.replace('iyy="1e-5"', 'iyy="3e-5"', 1)  # more than the two others
         tree, notes = self.read("heavy.urdf", heavy)
-        words = r"have no mass.*base \(0.128 kg\).*their mass and size do not allow.*f1_a"
+        words = r"have no mass.*base \(0.128 kg\).*their mass and size do not allow.*f1_a.*f1_b"
         self.assertRegex(notes, words)  # its box of water
         self.assertLess(np.linalg.eigvalsh(tree.link("f1_a").inertia).max(), 1e-4)
 

@@ -81,7 +81,13 @@ class Played(InFolder):
         session.pull(start + np.array((0.0, -0.1, 0.2)))
         self.assertGreater(self.steps(0.7).object_pos[2], start[2] + 0.1)
         session.release()
-        self.assertLess(self.steps(0.7).object_pos[2], start[2] + 0.05)
+        top = np.add(self.steps(0.7).object_pos, (0.0, 0.0, 0.05))
+        self.assertLess(top[2], start[2] + 0.1)
+        session.grab(None, top)
+        session.pull(np.add(top, (0.1, 0.0, 0.0)))
+        _, force, torque = session._pulled()
+        self.assertGreater(min(force[0], torque[1]), 0.0, "about y, from z to x")
+        session.release()
 
     def test_a_force_at_the_arm_moves_it_as_far_as_its_drives_give_way(self):
         session = self.session

@@ -90,8 +90,9 @@ class Pictures(TestCase):
     def test_points_are_drawn_over_everything_and_missing_ones_or_far_ones_left_out(self):
         color = (1.0, 0.0, 1.0)
         inside = np.array([0.4, 0.1, 0.3])
-        # the second is behind the camera
-        outside = [[50.0, 0, 0], [1.3, -1.5, 0.9], [1.28, -0.5, 0.9], [np.nan] * 3]
+        # the second is behind the camera, in line with a place in the picture
+        behind = 2 * np.array(self.camera.eye) - inside - (0.1, 0.0, 0.0)
+        outside = [[50.0, 0, 0], behind, [1.28, -0.5, 0.9], [np.nan] * 3]
         points = Points(pos=np.array([inside, *outside]), color=color, radius=0.012)
         picture = self.renderer.draw(self.home, at(*inside), points=[points])
         y, x = np.nonzero((picture == (255, 0, 255)).all(axis=-1))

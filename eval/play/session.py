@@ -169,7 +169,6 @@ class Session:
         world = SingleWorld(name, self.scene, self.world.state)
         self.world.close()
         self.world = world
-        self._set_gravity()
 
     @property
     def engine(self) -> str:

@@ -281,7 +281,7 @@ def _with_ranges(tree: RobotTree, path: str | Path, notes: list[str]) -> RobotTr
         units[kind] = 1.0
         if far and 2 * len(far) >= len(stated):
             units[kind] = unit
-            notes.append(f"limits of joints, up to {max(far):g}, are read as {name}")
+            notes.append(f"limits and offsets of joints, up to {max(far):g}, are read as {name}")
         elif kind == "revolute" and len(stated) > 1 and max(stated) < _LEAST_TURN:
             raise RobotError(
                 f"{path}: no joint turns by more than {max(stated):.2g} rad. Are the limits missing, or in other "
@@ -292,7 +292,8 @@ def _with_ranges(tree: RobotTree, path: str | Path, notes: list[str]) -> RobotTr
     unlimited = []
     for joint in tree.moved_by.values():
         unit = units[joint.type]
-        joint = replace(joint, lower=joint.lower * unit, upper=joint.upper * unit)
+        mimic = joint.mimic and replace(joint.mimic, offset=joint.mimic.offset * unit)
+        joint = replace(joint, lower=joint.lower * unit, upper=joint.upper * unit, mimic=mimic)
         if max(abs(joint.lower), abs(joint.upper)) > _FARTHEST[joint.type]:
             far = _TURNS if joint.type == "revolute" else _SLIDE
             unlimited.append(joint.name)

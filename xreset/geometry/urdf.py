@@ -231,13 +231,13 @@ def mismatches(robot: RobotSpec, tree: RobotTree) -> dict[str, list[str]]:
     }
     for tip in robot.fingertips:
         named[f"fingertip {tip.name!r}"] = [tip.link, *tip.contact_links]
-    known = ", ".join(tree.link_names)
+    known = tree.link_names
     links = []
     for entry, names in named.items():
-        absent = [repr(link) for link in dict.fromkeys(names) if link not in tree.link_names]
+        absent = [repr(link) for link in dict.fromkeys(names) if link not in known]
         if absent:
             links.append(
-                f"{entry}: the URDF has no link {', '.join(absent)}. Choose from: {known}."
+                f"{entry}: the URDF has no link {', '.join(absent)}. Choose from: {', '.join(known)}."
             )
     return {"joints": joints, "links": links}
 
@@ -333,9 +333,16 @@ def _refuse_xacro(path: Path, root: Element) -> None:
 
 def mesh_files(urdf: Path, kind: str = "collision") -> list[Path]:
     """Return the mesh files of a URDF's shapes of a kind, as far as they exist."""
-    meshes = parse_xml(urdf).iterfind(f"link/{kind}/geometry/mesh")
-    files = [find_mesh(mesh.get("filename", ""), urdf) for mesh in meshes]
+    changed = urdf.stat().st_mtime_ns if os.path.isfile(urdf) else 0
+    files = [find_mesh(name, urdf) for name in _mesh_names(urdf, changed, kind)]
     return [file for file in files if file is not None]
+
+
+@lru_cache(maxsize=16)
+def _mesh_names(urdf: Path, changed: int, kind: str) -> list[str]:
+    """Return the names of a URDF's mesh files; its time of change [ns] makes the cache read a changed file again."""
+    meshes = parse_xml(urdf).iterfind(f"link/{kind}/geometry/mesh")
+    return [mesh.get("filename", "") for mesh in meshes]
 
 
 @lru_cache(maxsize=16)

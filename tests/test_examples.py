@@ -17,6 +17,7 @@ import trimesh
 import xreset
 from tests.data import InFolder, InOneFolder, refuses
 from tests.toy_bank import ONLY_FRAMES
+from tests.toy_retarget import retargets_quickly
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 NUMBERED = sorted(EXAMPLES.glob("[0-9]*.py"))
@@ -90,7 +91,7 @@ class ShelfTest(InFolder):
         trimesh.creation.cylinder(radius=0.035, height=0.09).export(self.folder / "beaker.obj")
         film = partial(xreset.film, fps=2, size=(320, 240))
         make_bank = partial(xreset.make_bank, **ONLY_FRAMES)
-        with mock.patch.multiple(xreset, film=film, make_bank=make_bank):
+        with mock.patch.multiple(xreset, film=film, make_bank=make_bank), retargets_quickly():
             run("00_film_a_policy", self.folder, "beaker", f"{self.folder}/film.mp4")
         self.assertGreater((self.folder / "film.mp4").stat().st_size, 2_000)
 
@@ -106,7 +107,8 @@ class FromABankTest(InOneFolder):
     def setUpClass(cls):
         super().setUpClass()
         cls.loaded = run("01_load_and_view", cls.folder)
-        cls.retargeted = run("02_retarget_own_keypoints", cls.folder)
+        with retargets_quickly():
+            cls.retargeted = run("02_retarget_own_keypoints", cls.folder)
         cls.bank = cls.folder / "bank.npz"
 
     def test_a_bank_is_made(self):

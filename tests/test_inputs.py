@@ -11,6 +11,7 @@ from numpy.testing import assert_array_equal
 
 from tests.data import InOneFolder, refuses
 from tests.toy_bank import SOUP, SPAM, toy_bank, toy_retargeted
+from tests.toy_retarget import retargets_quickly
 from xreset import (
     Retargeted,
     evaluate,
@@ -63,7 +64,8 @@ class InputsTest(InOneFolder):
         self.assertEqual(
             ([o.name for o in demos.objects], len(demos.bank.sequence_name)), ([SOUP], 1)
         )
-        motion = load_inputs(demos.motion())
+        with retargets_quickly():
+            motion = load_inputs(demos.motion())
         self.assertIsInstance(motion.data, Retargeted)
         self.assertEqual((motion.robot_name, motion.hash), ("ur7e-sharpa", None))
         self.assertEqual(motion.bank.num_states, 0)

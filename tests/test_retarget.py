@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import replace
-from functools import partial
 from unittest import TestCase
 from unittest.mock import patch
 
@@ -14,7 +13,15 @@ from torch.testing import assert_close
 
 from tests.command import refused, succeeds
 from tests.data import InOneFolder, data_dir, refuses, upright
-from tests.toy_retarget import FLOAT, arm_targets, box_object, check_gradient, double, hand_targets
+from tests.toy_retarget import (
+    FLOAT,
+    arm_targets,
+    box_object,
+    check_gradient,
+    double,
+    hand_targets,
+    retargets_quickly,
+)
 from tests.toy_robot import toy_motion, toy_robot
 from xreset import read_retargeted, robots, write_retargeted
 from xreset.demos.archive import demo_objects, read_demos, rest_on_table, write_demos
@@ -235,6 +242,10 @@ class HandTest(TestCase):
         expected = distance - balls.radii[ball] - HandWeights().object_clearance
         assert_close(near.value[mine], expected, atol=1e-9, rtol=0)
 
+    def test_a_hand_is_filled_once(self):
+        with patch("xreset.retarget.hand.model.hand_balls", side_effect=AssertionError):
+            HandModel(self.robot)
+
     def test_pairs_for_any_subset_of_keypoints(self):
         names = ["wrist", "thumb4", "index4", "middle4"]
         jaws = keypoint_pairs(names, ("hand", "left", "right", "right"))
@@ -387,11 +398,9 @@ class PipelineTest(InOneFolder):
         return self.folder / name
 
     def commanded(self, name, robot, *options):
-        """What the command prints that retargets demonstrations, here with little effort."""
+        """What the command prints that retargets demonstrations."""
         out = self.folder / f"{name}-robot.npz"
-        effort = {"hand": HandWeights(tolerance=0.1), "arm": ArmSearch(restarts=8, branches=1)}
-        quick = partial(RetargetConfig, **effort)
-        with patch("xreset.retarget.pipeline.RetargetConfig", quick):
+        with retargets_quickly():
             demos = f"{self.folder}/{name}.npz"
             return succeeds("retarget", demos, "--robot", robot, "--out", out, *options)
 

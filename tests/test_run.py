@@ -10,6 +10,7 @@ import xreset
 from tests.command import refused
 from tests.command import xreset as xreset_command
 from tests.toy_results import InFolder
+from tests.toy_retarget import retargets_quickly
 from xreset.cli import perform
 from xreset.cli import run as command
 from xreset.demos.archive import write_demos
@@ -38,7 +39,7 @@ class Run(InFolder, TestCase):
             if words[0] in ("retarget", "resets"):
                 perform(words)
 
-        with patch.object(command, "perform", step):
+        with patch.object(command, "perform", step), retargets_quickly():
             xreset.run(f"{self.folder}/{demos}", robot=robot, out=f"{self.folder}/v0.1", **options)
         return verbs
 

@@ -14,6 +14,7 @@ from tests.command import calls_of, succeeds
 from tests.data import InFolder, InOneFolder, refuses
 from tests.toy_bank import SOUP
 from tests.toy_results import toy_result, toy_rollouts
+from tests.toy_retarget import retargets_quickly
 from xreset import synthesize, write_demos
 from xreset.cli import main
 from xreset.errors import FileFormatError, ObjectError, RunError, XResetError
@@ -469,7 +470,7 @@ class WholeTest(InOneFolder):
         cls.out = cls.folder / "out"
         # another interpreter for each command takes longer than most commands; LaunchTest starts some
         here = patch("xreset.eval.study.launch._run", lambda command: main(command[len(XRESET) :]))
-        with here:
+        with here, retargets_quickly(), patch("xreset.eval.report.clips.SIZE", (80, 60)):
             cls.said = succeeds("study seconds --out", cls.out)
         cls.text = study_path("seconds").read_text()
 

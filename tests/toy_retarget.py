@@ -1,6 +1,7 @@
-"""Targets for tests of retargeting, and derivatives by central differences."""
+"""Targets for tests of retargeting, retargeting with little effort, and derivatives by central differences."""
 
 import dataclasses
+from unittest.mock import patch
 
 import numpy as np
 import torch
@@ -8,9 +9,12 @@ from torch.testing import assert_close
 
 from xreset.geometry.rotations import matrix_to_quat, quat_from_axis_angle, quat_multiply
 from xreset.geometry.shapes import box, surface_of
+from xreset.retarget.arm.config import ArmSearch
 from xreset.retarget.arm.model import ArmTargets
+from xreset.retarget.hand.config import HandWeights
 from xreset.retarget.hand.cost import system
 from xreset.retarget.hand.model import HandState, HandTargets
+from xreset.retarget.pipeline import RetargetConfig
 from xreset.spec import ObjectSpec
 
 FLOAT = torch.float64
@@ -22,6 +26,14 @@ def double(values):
 
 
 UPRIGHT = double([1.0, 0.0, 0.0, 0.0])
+LITTLE_EFFORT = RetargetConfig(
+    hand=HandWeights(tolerance=0.1), arm=ArmSearch(restarts=8, branches=1)
+)
+
+
+def retargets_quickly():
+    """Motion is found with little effort where no configuration is given."""
+    return patch("xreset.retarget.pipeline.RetargetConfig", lambda: LITTLE_EFFORT)
 
 
 def box_object(*boxes):

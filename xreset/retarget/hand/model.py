@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import pairwise
 
 import numpy as np
@@ -17,7 +18,7 @@ from torch import Tensor
 
 from xreset.errors import RobotError
 from xreset.files.checks import frozen
-from xreset.geometry.balls import hand_balls
+from xreset.geometry.balls import Balls, hand_balls
 from xreset.geometry.collision import SelfCollision
 from xreset.geometry.fields import DistanceFields
 from xreset.geometry.kinematics import Kinematics
@@ -76,6 +77,13 @@ class HandState(Tensors):
         return homogeneous(quat_to_matrix(self.root_quat), self.root_pos)
 
 
+@lru_cache(maxsize=8)
+def _balls_of(robot: RobotSpec, fingerprint: str) -> Balls:
+    """Fill a robot's hand, which takes up to a second, once in a process; the fingerprint is also of its files."""
+    hand = Kinematics(robot, root=robot.hand_root)
+    return hand_balls(hand, SelfCollision(hand, only=robot.self_collision_links))
+
+
 class HandModel:
     """A robot's hand as a floating tree, and the human keypoints that its links follow."""
 
@@ -86,7 +94,6 @@ class HandModel:
             RobotError: the description does not allow retargeting; the message names the wrong entry.
         """
         self.robot = robot
-        on_cpu = Kinematics(robot, root=robot.hand_root)
         self.kinematics = Kinematics(robot, root=robot.hand_root, device=device)
         self.device = self.kinematics.device
         if not np.array_equal(self.kinematics.joint_indices, robot.hand_indices):
@@ -126,8 +133,7 @@ class HandModel:
         """[P, 3] keypoints at home, in the root's frame."""
         self.table = TableSpec()
 
-        collision = SelfCollision(on_cpu, only=robot.self_collision_links)
-        self.balls = hand_balls(on_cpu, collision).to(self.device)
+        self.balls = _balls_of(robot, robot.fingerprint).to(self.device)
         """Balls that keep the hand out of the object, the table and itself."""
         pads = self._pads()
         self.pad_balls = torch.cat(pads)

@@ -122,6 +122,7 @@ class Pictures(TestCase):
             self.home, T
         )
         self.assertEqual(smooth.shape, own.shape)
+        self.assertIs(render._rays(near, self.size), render._rays(near, self.size))
         self.assertLess(np.abs(smooth.astype(float) - own).mean(), 3.0)
 
     def test_parts_are_told_apart_by_color(self):

@@ -10,6 +10,7 @@ import io
 import math
 import tempfile
 from collections.abc import Iterable, Sequence
+from functools import lru_cache
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -83,16 +84,6 @@ class Camera:
     def focal_length(self, height: int) -> float:
         """Focal length in pixels of a picture of this height."""
         return height / 2 / math.tan(self.fov / 2)
-
-    def rays(self, size: Size) -> np.ndarray:
-        """[H * W, 3] float32 directions of the pixels' rays, row by row; their length along the view axis is 1."""
-        width, height = size
-        y, x = np.mgrid[:height, :width].astype(np.float32) + 0.5
-        right = (x - width / 2) / self.focal_length(height)
-        down = (y - height / 2) / self.focal_length(height)
-        return np.stack((right, down, np.ones_like(x)), axis=-1).reshape(-1, 3) @ np.float32(
-            self.axes()
-        )
 
     def project(self, points: np.ndarray, size: Size) -> tuple[np.ndarray, np.ndarray]:
         """Return pixels [P, 2] and distances along the view axis [P] of world points [P, 3] that are before the
@@ -302,8 +293,8 @@ def _image(
 ) -> Image.Image:
     """Draw at twice the size; without ``smooth``, from one ray for each 2 x 2 pixels."""
     width, height = size
-    rays_size = (2 * width, 2 * height) if smooth else size
-    rays = camera.rays(rays_size)
+    rays_size = (2 * width, 2 * height) if smooth else (width, height)
+    rays = _rays(camera, rays_size)
     sky = np.linspace(*SKY_COLORS, rays_size[1], dtype=np.float32)
     picture = np.repeat(sky, rays_size[0], axis=0)
     depth = _shade(picture, scene, camera, rays, shadows=True)
@@ -314,6 +305,17 @@ def _image(
     pixels = (picture.clip(0, 1) * 255 + 0.5).astype(np.uint8)
     image = Image.fromarray(pixels.reshape(rays_size[1], rays_size[0], 3))
     return image.resize((2 * width, 2 * height), Image.Resampling.NEAREST)
+
+
+@lru_cache(maxsize=4)  # all pictures of a film have the same
+def _rays(camera: Camera, size: Size) -> np.ndarray:
+    """[H * W, 3] float32 directions of the pixels' rays, row by row; their length along the view axis is 1."""
+    width, height = size
+    y, x = np.mgrid[:height, :width].astype(np.float32) + 0.5
+    right = (x - width / 2) / camera.focal_length(height)
+    down = (y - height / 2) / camera.focal_length(height)
+    directions = np.stack((right, down, np.ones_like(x)), axis=-1).reshape(-1, 3)
+    return directions @ np.float32(camera.axes())
 
 
 def _shade(

@@ -25,7 +25,8 @@ from xreset.robot_tools.couplings import SLIDE, Couplings, Pull, joint_name
 from xreset.spec import Geometry, MimicSpec, Shape
 
 _COMPILE = """
-import resource, sys
+import os, resource, sys
+os.environ["MUJOCO_GL"] = "disable"  # else another process looks for libraries of windows
 import mujoco
 source, target, most, unit = sys.argv[1:]
 with open("/proc/self/statm") as pages:

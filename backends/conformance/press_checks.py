@@ -88,15 +88,18 @@ def robot_friction(bench: Bench) -> Measured:
     The drive of the slide pulls with mu times the force with which the other drive presses.
     """
     errors: dict[str, list[tuple[str, Tensor]]] = {place: [] for place in _PLACES}
-    cases = list(product(_PLACES, _FRICTIONS))
-    friction = torch.tensor([values for _, values in cases])
-    for foot, shelf in (("tip", "link"), ("link", "link"), ("tip", "tip")):
+    for foot, shelf, places in (
+        ("tip", "link", _PLACES),
+        ("link", "link", _PLACES),
+        ("tip", "tip", ("shelf",)),
+    ):
+        cases = list(product(places, _FRICTIONS))
         fingers = {"thumb": ("foot",) if foot == "tip" else ()}
         fingers["index"] = ("shelf",) if shelf == "tip" else ()
         scene = _scene(bench, presser(**{name: links for name, links in fingers.items() if links}))
         start = _on(scene, [place for place, _ in cases])
         with bench.other(scene, [0] * len(cases)) as worlds:
-            worlds.set_parameter("friction", friction)
+            worlds.set_parameter("friction", torch.tensor([values for _, values in cases]))
             found = _dragged(worlds, scene, start)
         for (place, (tip, link, table)), mu in zip(cases, found, strict=True):
             own = {"tip": tip, "link": link}

@@ -49,17 +49,11 @@ HEAVY = {
 }
 
 
-def output_of(code):
-    """What some code prints in a new interpreter, on a wide terminal."""
-    command = [sys.executable, "-c", code]
-    wide = os.environ | {"COLUMNS": "300"}
-    return subprocess.run(command, check=True, capture_output=True, text=True, env=wide).stdout
-
-
 def modules_after(code):
     """Top-level modules that are loaded after running some code in a new interpreter."""
     code += "\nimport sys, json; print('\\n' + json.dumps(sorted({m.split('.')[0] for m in sys.modules})))"
-    return set(json.loads(output_of(code).strip().splitlines()[-1]))
+    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    return set(json.loads(done.stdout.strip().splitlines()[-1]))
 
 
 def commands():
@@ -408,14 +402,16 @@ class UsageTest(TestCase):
         self.assertEqual([*shown, bar.live.is_started], [False, True, False])
 
     def test_training_without_its_packages_says_what_to_install(self):
-        code = (
-            "import sys; sys.modules['rsl_rl'] = None; sys.stderr = sys.stdout\n"
-            "from xreset.cli import main\n"
-            "try: main(['train', '--out', 'x'])\n"
-            "except SystemExit as end: assert end.code == 1"
-        )
-        words = r"^xreset train: rsl-rl-lib cannot .* pip install 'xreset\[train\]'"
-        self.assertRegex(output_of(code), words)
+        loaded = [name for name in sys.modules if name.startswith("xreset.learning.")]
+        with (
+            patch.dict(sys.modules, dict.fromkeys(("rsl_rl", "rsl_rl.models"))),
+            patch.dict(vars(sys.modules["xreset.learning"])),
+        ):
+            for name in loaded:  # as where nothing is imported yet
+                del sys.modules[name]
+                vars(sys.modules["xreset.learning"]).pop(name.split(".")[2], None)
+            said = refused("train --out x")
+        self.assertRegex(said, r"^xreset train: rsl-rl-lib cannot .* pip install 'xreset\[train\]'")
 
     def test_a_missing_engine_is_named_with_the_command_that_installs_it(self):
         here = ".".join(map(str, sys.version_info[:2]))

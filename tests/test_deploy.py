@@ -25,7 +25,7 @@ from tests.command import refused, succeeds
 from tests.data import InFolder, refuses
 from tests.test_examples import EXAMPLES, run
 from tests.toy_bank import SOUP
-from tests.toy_policy import toy_graph
+from tests.toy_policy import graph_of, toy_graph
 from tests.toy_robot import endless_robot
 from xreset import (
     CameraConfig,
@@ -38,7 +38,7 @@ from xreset import (
 from xreset.errors import PolicyError, XResetError
 from xreset.eval.rollout import engine, episode_starts, load_trial, roll_out
 from xreset.live import cache
-from xreset.live.deploy import deployed_graph, with_objects, write_deployed
+from xreset.live.deploy import with_objects, write_deployed
 from xreset.live.engine import EngineDriver
 from xreset.live.graph import policy_graph
 from xreset.policy.onnx_policy import OnnxPolicy
@@ -496,7 +496,7 @@ class ToyTest(InFolder):
 class EndlessTest(InFolder):
     def test_a_joint_may_turn_without_limits(self):
         robot = endless_robot(self.folder)
-        controller = Controller(deployed_graph(Still(), robot, evaluation_task(TaskConfig())))
+        controller = Controller(graph_of(robot, value=0.0)[1])
         turned = 100.0
         start = np.float32(robot.home)
         start[0] = turned
@@ -513,13 +513,6 @@ class EndlessTest(InFolder):
         )
         controller.check_reading(reading)
         self.assertEqual(controller.step(reading)[0, 0], turned)
-
-
-class Still(torch.nn.Module):
-    """A network whose actions are 0, for seven joints."""
-
-    def forward(self, flat, cloud):
-        return 0.0 * flat[:, :7] + 0.0 * cloud.flatten(1)[:, :1]
 
 
 class RefusedTest(TestCase):

@@ -67,7 +67,7 @@ SILENT |= {"mesh: origin at its bottom", "time: rate times 0.2"}
 class Right(TestCase):
     def test_synthetic_demonstrations(self):
         for side, fps in (("right", 30), ("left", 10), ("left", 5), ("right", 120)):
-            demos = synthesize(["soup", "scissors", "banana"], 2, seed=4, side=side, fps=fps)
+            demos = synthesize(["soup", "scissors", "banana"], 1, seed=4, side=side, fps=fps)
             for known in (surfaces(demo_objects(demos)), None):
                 with self.subTest(side=side, fps=fps, known=bool(known)):
                     self.assertEqual([*map(str, examine(demos, known))], [])

@@ -30,7 +30,6 @@ from xreset.eval.report.clips import (
     best_everywhere,
     camera_for,
     draw_clips,
-    draw_report,
     make_film,
     worst_episodes,
 )
@@ -380,20 +379,6 @@ class ClipTest(Reported):
         expected = [[0, 1, 2, 2, 3], [0, 1, 2, 3, 4], [0, 1, 1, 1, 1]]
         self.assertEqual(([each.tolist() for each in shown], fps), (expected, 10.0))
 
-    def test_runs_of_two_robots_are_drawn_each_with_its_own(self):
-        folders = []
-        for name in ("openarm", "ur7e-robotiq"):
-            robot = load_robot(name)
-            rollouts = toy_rollouts(np.array(robot.home))
-            self.write_results(name, rollouts, joints=robot.joint_names, robot=name)
-            folders.append(self.folder / name)
-        clips, strips = draw_report(read_trainings(folders), None, None)
-        runs = [clip.episode.run for clip in clips]
-        self.assertEqual((runs, strips), (["openarm", "ur7e-robotiq"], []))
-        shapes = {clip.frames.shape for clip in clips}
-        self.assertEqual(shapes, {(3, 300, 400, 3)})
-        self.assertTrue((clips[0].frames != clips[1].frames).any())
-
 
 class FailureTest(Reported):
     def test_the_worst_come_first_and_objects_take_turns(self):
@@ -569,21 +554,21 @@ class PageTest(Reported):
 
 class SeveralTest(Reported):
     def test_films_of_several_runs_are_of_one_episode_in_one_engine(self):
-        robot = robots.load("openarm")
-        for name in ("a", "b"):
-            self.write_results(
-                name,
-                toy_rollouts(robot.home),
-                ("mujoco", "sapien"),
-                joints=robot.joint_names,
-                robot="openarm",
-            )
-        runs = [self.folder / name for name in ("a", "b")]
+        """Each run is drawn with its own robot."""
+        names = ["openarm", "ur7e-robotiq"]
+        runs = []
+        for name in names:
+            robot = load_robot(name)
+            rollouts = toy_rollouts(robot.home)
+            engines = ("mujoco", "sapien")
+            runs.append(self.write_results(name, rollouts, engines, robot.joint_names, robot=name))
         report = make_report(runs, self.folder / "both")
-        self.assertEqual([clip.episode.run for clip in report.clips], ["a", "b"])
-        self.assertEqual({clip.episode.engine for clip in report.clips}, {"mujoco"})
+        first, second = report.clips
+        self.assertEqual([clip.episode.run for clip in report.clips], names)
+        self.assertEqual((first.episode.engine, second.episode.engine), ("mujoco", "mujoco"))
+        self.assertTrue((first.frames != second.frames).any())
         self.assertEqual(report.page.read_text().count("<video"), 2)
-        self.write_results("b", robot="openarm", inputs={"demos": "cd"})
+        self.write_results(names[1], robot=names[1], inputs={"demos": "cd"})
         report = make_report(runs, self.folder / "both")
         self.assertIn("no films: the runs were evaluated with different", report.notes[-1])
 

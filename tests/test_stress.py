@@ -169,7 +169,8 @@ class CommandTest(InFolder):
         self.assertEqual(row, ["action-latency", 0.02])
         self.assertIn("left out in mujoco, which cannot set them: arm-stiffness", out)
         self.assertNotIn("camera", out)
-        page = succeeds("report", self.folder)
+        with patch("xreset.eval.report.clips.SIZE", (80, 60)):
+            page = succeeds("report", self.folder)
         self.assertIn("index.html", page)
         text = (self.folder / "report" / "index.html").read_text()
         self.assertIn("What it tolerates", text)

@@ -18,12 +18,16 @@ from xreset.task.config import TaskConfig, evaluation_task
 @cache
 def toy_graph():
     """Return the network of a policy of the toy gripper, and the policy as one graph."""
-    robot = toy_grasp.robot()
+    return graph_of(toy_grasp.robot(), toy_grasp.brick(), value=0.01)
+
+
+def graph_of(robot, *objects, value):
+    """Return the network of a policy of a robot, with one value for all weights, and the policy as one graph."""
     task = evaluation_task(TaskConfig())
-    trained = asdict(policy_contract(robot, task, ("brick",)))
+    trained = asdict(policy_contract(robot, task, tuple(obj.name for obj in objects)))
     with tempfile.TemporaryDirectory() as folder:
-        network = write_policy(Path(folder) / "toy.onnx", trained, value=0.01).read_bytes()
-    return network, deployed_graph(network, robot, task, [toy_grasp.brick()])
+        network = write_policy(Path(folder) / "toy.onnx", trained, value=value).read_bytes()
+    return network, deployed_graph(network, robot, task, objects)
 
 
 def write_policy(

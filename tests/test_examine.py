@@ -219,11 +219,15 @@ class Wrong(InFolder):
         raised = demos.object_pos.copy()
         raised[:, 2] += rest_height(obj, tilted[0]) - raised[0, 2]
         offset = demos.hand_keypoints + np.float32([0.0, 0.025, 0.0])
-        fall = np.linspace(0.0, 0.6, len(lost))[:, None] * np.float32([0.0, 0.0, -1.0])
-        below = {
-            "object_pos": demos.object_pos + fall,
-            "hand_keypoints": demos.hand_keypoints + fall[:, None],
-        }
+        deep = offset + np.float32([0.0, 0.005, 0.0])
+
+        def carried(up):
+            shift = np.full(len(lost), up)[:, None] * np.float32([0.0, 0.0, 1.0])
+            points = demos.hand_keypoints + shift[:, None]
+            return {"object_pos": demos.object_pos + shift, "hand_keypoints": points}
+
+        below = carried(np.linspace(0.0, -0.6, len(lost)))
+        after = np.arange(len(lost)) >= 50
         for words, wrong, changed in (
             (
                 "does not change at all for 0.3 s or longer, before or after a jump",
@@ -247,6 +251,9 @@ class Wrong(InFolder):
                 {"object_pos": raised, "object_quat_wxyz": tilted},
             ),
             ("with the hand shifted by", False, {"hand_keypoints": offset}),
+            ("The hand is .* mm inside the moving object", False, {"hand_keypoints": deep}),
+            ("jumps from frame to frame, first in frame 50", False, carried(after * 0.2)),
+            ("starts 25 cm above the table", True, carried(0.25)),
             ("The object is .* cm inside the table later. The table's frame", True, below),
         ):
             with self.subTest(words):

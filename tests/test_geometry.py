@@ -53,6 +53,16 @@ class SurfaceTest(TestCase):
         assert_allclose(distance, self.exact, atol=4e-3)
         self.assertLess(np.abs(distance - self.exact).mean(), 4e-4)
 
+    def test_signed_distance_beyond_the_grid(self):
+        far = 5 * self.points
+        distance = distances(self.surface.field, far)
+        assert_allclose(self.surface.signed_distance(far), distance, atol=1e-5)
+        which = torch.zeros(len(far), dtype=torch.long)
+        _, found = self.surface.field.signed_distance(torch.as_tensor(far), which)
+        for axis, step in enumerate(1e-7 * np.eye(3)):
+            slope = (distances(self.surface.field, far + step) - distance) / 1e-7
+            assert_allclose(found[:, axis], slope, atol=1e-4)
+
     def test_the_grid_of_a_large_object_is_coarse(self):
         size = (0.6, 0.8, 1.0)
         with patch("xreset.geometry.surface._MOST_CELLS", 3e4):

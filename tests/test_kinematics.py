@@ -291,9 +291,11 @@ class KinematicsTest(InOneFolder):
 
     def test_limits_take_the_mimic_joint_into_account(self):
         # Joints are in the order of the description. The mimic, at half its travel, is the first to end.
-        self.assertAlmostEqual(
-            self.kinematics.upper[self.robot.joint_names.index("jaw_a")].item(), 0.025
-        )
+        jaw = self.robot.joint_names.index("jaw_a")
+        self.assertAlmostEqual(self.kinematics.upper[jaw].item(), 0.025)
+        (mimic,) = self.robot.mimics
+        backwards = replace(self.robot, mimics=(replace(mimic, multiplier=-1.0),))
+        self.assertAlmostEqual(Kinematics(backwards).upper[jaw].item(), 0.005)
 
     def test_errors_name_the_cause(self):
         with self.assertRaisesRegex(RobotError, "no link 'nose' below"):

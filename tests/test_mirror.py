@@ -9,6 +9,7 @@ from scipy.spatial import cKDTree
 from tests.command import succeeds
 from tests.data import InOneFolder
 from tests.test_demos import in_frame
+from tests.toy_bank import shifted
 from tests.toy_retarget import box_object
 from xreset import load_object, merge_demos, read_demos, synthesize, write_demos
 from xreset.demos.mirror import mirrored, symmetry
@@ -26,7 +27,7 @@ class MirrorTest(InOneFolder):
     def setUpClass(cls):
         super().setUpClass()
         cls.demos = synthesize(["mustard"], 1, 0, side="left")
-        cls.object = load_object("mustard")
+        cls.object = shifted(load_object("mustard"), np.array([0.03, 0.02, 0.01]))
         cls.symmetries = {cls.object.name: symmetry(cls.object)}
         cls.found = mirrored(cls.demos, cls.symmetries)
 

@@ -318,11 +318,12 @@ class MeshImport(InFolder):
 
     def test_a_hollow_objects_mass_is_on_its_surface(self):
         mesh = trimesh.creation.icosphere(4, 0.1).apply_translation((0.1, 0.2, 0.3))
-        for mass, moment in (
-            (0.3, 0.002),
-            (3.0, 0.012),
-        ):  # 2/3 m r^2 of a shell: 0.3 kg in 4.2 l; 2/5 m r^2 of a solid
-            found = self.load(mesh, facts=f"mass = {mass}").obj
+        for facts, moment in (  # 2/3 m r^2 of a shell: 0.3 kg in 4.2 l; 2/5 m r^2 of a solid
+            ("mass = 0.3", 0.002),
+            ("mass = 3.0", 0.012),
+            ("density = 71.9", 0.0012),
+        ):
+            found = self.load(mesh, facts=facts).obj
             assert_allclose(np.diag(found.inertia), moment, rtol=0.01)
             assert_allclose(found.com, (0.1, 0.2, 0.3), atol=1e-6)
 

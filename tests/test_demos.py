@@ -158,6 +158,7 @@ class Archive(InFolder):
         for options, message in (
             ({"side": "left"}, "no hand side left. Choose from: 'right'"),
             ({"indices": [4]}, "there are 4 sequences"),
+            ({"indices": [1, 1]}, r"index occurs twice in \[1, 1\]"),
             (
                 {"objects": ["soup", "cup", "mug"]},
                 "Unknown objects 'cup', 'mug'. Choose from: 005_tomato_soup_can",

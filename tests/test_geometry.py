@@ -164,6 +164,8 @@ class ShapesTest(TestCase):
         middle = np.abs(points[:, 0]) < 0.015  # at its open ends a ball of a gap's size looks in
         assert_allclose(found[middle], solid[middle], atol=1e-3)
         self.assertGreater((found - solid).min(), -1e-3)
+        apart = [box((0, 0, z), (0.06, 0.04, 0.001)) for z in (-0.0155, 0.0155)]
+        self.assertGreater(distances(link_field(apart), np.zeros((1, 3)))[0], 0.01)
 
     def test_distances_to_every_kind_of_shape(self):
         points = default_rng(0).uniform(-0.07, 0.07, (300, 3))

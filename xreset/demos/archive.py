@@ -181,8 +181,8 @@ class Demos(ObjectMotions):
             indices: sequence indices; the result has their order.
 
         Raises:
-            DemoError: unknown index, name, object or subject (the message names all of them), no such hand, a share
-                that is none, ``pick`` or ``seed`` without effect, or nothing is left.
+            DemoError: unknown or repeated index, unknown name, object or subject (the message names all of them), no
+                such hand, a share that is none, ``pick`` or ``seed`` without effect, or nothing is left.
         """
         if pick not in ("first", "spread", "random"):
             raise DemoError(f"pick is {shown(pick)}, expected first, spread or random.")
@@ -204,6 +204,8 @@ class Demos(ObjectMotions):
                 raise DemoError(
                     f"Unknown sequence index in {chosen.tolist()}: there are {len(self)} sequences."
                 )
+            if len({*chosen.tolist()}) < len(chosen):
+                raise DemoError(f"A sequence index occurs twice in {chosen.tolist()}.")
         if objects is not None:
             try:
                 objects = canonical_names(objects, self.object_names)

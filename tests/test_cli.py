@@ -402,14 +402,12 @@ class UsageTest(TestCase):
         self.assertEqual([*shown, bar.live.is_started], [False, True, False])
 
     def test_training_without_its_packages_says_what_to_install(self):
-        loaded = [name for name in sys.modules if name.startswith("xreset.learning.")]
-        with (
-            patch.dict(sys.modules, dict.fromkeys(("rsl_rl", "rsl_rl.models"))),
-            patch.dict(vars(sys.modules["xreset.learning"])),
-        ):
-            for name in loaded:  # as where nothing is imported yet
-                del sys.modules[name]
-                vars(sys.modules["xreset.learning"]).pop(name.split(".")[2], None)
+        import_module("xreset.learning.train")  # what others need of it stays imported
+        package = vars(sys.modules["xreset.learning"])
+        with patch.dict(sys.modules, {"rsl_rl.models": None}), patch.dict(package):
+            for name in ("train", "export", "model"):  # as where nothing is imported yet
+                sys.modules.pop(f"xreset.learning.{name}", None)
+                package.pop(name, None)
             said = refused("train --out x")
         self.assertRegex(said, r"^xreset train: rsl-rl-lib cannot .* pip install 'xreset\[train\]'")
 

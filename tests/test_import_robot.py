@@ -29,7 +29,7 @@ from xreset.robot_tools import check as checks
 from xreset.robot_tools import homes
 from xreset.robot_tools.check import check
 from xreset.robot_tools.draft import hand_side
-from xreset.robot_tools.fingers import _stated_finger
+from xreset.robot_tools.fingers import Hand, _stated_finger
 from xreset.robot_tools.importer import make_robot
 from xreset.robot_tools.sources import _at, bare, completed, grounded, read_source, renamed
 from xreset.spec import SceneSpec, TableSpec
@@ -472,6 +472,11 @@ class Toy(Robots):
             notes, r"coupled joints: 'l_finger', 'l_rocker', .* with 'l_crank'; .* 0.00 mm"
         )
         self.assertRegex(notes, "bars of a linkage: l_rod, r_rod")
+
+    def test_the_fingers_of_a_jaw_are_thumb_and_index_whatever_their_names(self):
+        text = JAW.replace('"l_pad"', '"lf_tip"').replace('"r_pad"', '"rf_tip"')
+        hand = Hand(self.read("jaw.xml", text)[0], self.folder, None, [])
+        self.assertEqual([tip.name for tip in hand.tips], ["thumb", "index"])
 
     def test_damaged_or_huge_mjcf_is_refused(self):
         world = "<worldbody>"

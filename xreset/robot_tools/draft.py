@@ -18,7 +18,7 @@ from xreset.geometry.urdf_writer import urdf_text, write_meshes
 from xreset.spec import DriveSpec, FingertipSpec, JointSpec, KeypointSpec, RobotSpec
 
 _BASE = ((0.85, 0.85, 0.10), (0.6427876, 0.0, 0.0, -0.7660444))
-"""Where the arm stands until `robots place` finds better: on the table, next to the person, its x turned by
+"""Where the arm stands until `robots place` finds better: at the table's edge, next to the person, its x turned by
 -100 degrees. Five published hands on xArm7 and iiwa 14 follow 98 % or more of five DexYCB sequences from there."""
 _ARMATURE = 0.1
 """[kg m^2] Rotor inertia of the arm's joints, as in the built-in robots."""

@@ -293,7 +293,7 @@ class Hand:
         if len(chains) < 2:
             raise RobotError(
                 f"below {self.root!r} there are {len(chains)} chains of moving links, expected a thumb and at least "
-                "one finger."
+                "one finger. Of a gripper, both jaws must move."
             )
         chains = [replace(chain, points=self._points(chain)) for chain in chains]
         for chain in chains:
@@ -305,7 +305,10 @@ class Hand:
         first = self._find_thumb(chains, thumb)
         others = [chain for chain in chains if chain is not first]
         names = {chain.name for chain in others}
-        if not names <= set(_FINGERS) or len(names) < len(others):
+        is_jaw = (
+            len(others) == 1 and first.name != "thumb"
+        )  # lf and rf may be a left and a right jaw
+        if not names <= set(_FINGERS) or len(names) < len(others) or is_jaw:
             if len(others) > len(_FINGERS):
                 raise RobotError(
                     f"the hand has {len(others)} fingers and a thumb; xreset knows {', '.join(_FINGERS)}."

@@ -174,15 +174,17 @@ class Wrong(InFolder):
                 self.assertNotRegex(str(found), "order|inverted")
 
     def test_orders_of_quaternions_of_round_and_flat_objects(self):
-        """The slip alone does not tell these; lean, depth and height do."""
+        """The slip alone does not tell these; lean, depth and height do. The table's frame is tilted by a degree."""
         meshes = data_dir() / "ycb20"
         for archive, name, shift, order in (
             ("right_9x20", "20200820-subject-03/20200820_140158", -1, "(x, y, z, w)"),
             ("right_9x20", "20200908-subject-05/20200908_144439", -1, "(x, y, z, w)"),
             ("right_9x20", "20200908-subject-05/20200908_144342", 1, "(w, x, y, z)"),
+            ("right_9x20", "20200903-subject-04/20200903_113048", 1, "(w, x, y, z)"),
             ("right_11x20", "20201022-subject-10/20201022_112255", 1, "(w, x, y, z)"),
         ):
             demos = read_demos(data_dir() / f"dexycb_{archive}.npz").select(sequences=[name])
+            demos = replace(demos, subjects=None, T_level_from_table=None)
             quats = np.roll(demos.object_quat_wxyz, shift, axis=1)
             with self.subTest(name):
                 known = surfaces_of(demos, meshes)

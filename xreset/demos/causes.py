@@ -14,7 +14,6 @@ from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from xreset.files.checks import frozen
@@ -85,10 +84,6 @@ _BASE = 0.1
 """Time over which speeds are measured, longer than a tracker's noise matters [s]."""
 _LEAST_STEP = 0.02
 """Motion of the object in this time that counts [m]."""
-_SUPPORT = 0.015
-"""Vertices this close above the lowest one support an object [m]: poses are tilted by some degrees."""
-_OVERHANG = 0.010
-"""An object whose center of mass is farther outside of its support than this would fall over [m]."""
 _NEXT_FACE = np.cos(np.radians(30.0))
 """Cosine of the largest angle to the face that it would rest on."""
 _THICK = 0.020
@@ -266,20 +261,6 @@ class Recording:
         return float(np.linalg.norm(beyond.clip(0.0)))
 
     @cached_property
-    def falls(self) -> bool:
-        """Whether the object would fall over at the start; False if its mesh is unknown."""
-        if self.surface is None:
-            return False
-        obj = self.surface.obj
-        corners = self.turn[0].apply(obj.vertices)
-        low = corners[corners[:, 2] < corners[:, 2].min() + _SUPPORT, :2]
-        com = self.turn[0].apply(obj.com)[:2]
-        # two more points: a support that is a point or a line spans no area
-        low = np.concatenate((low, low[:1] + np.array([[1e-4, 0.0], [0.0, 1e-4], [1e-4, 1e-4]])))
-        sides = ConvexHull(low, qhull_options="QJ").equations
-        return bool((sides[:, :2] @ com + sides[:, 2]).max() > _OVERHANG)
-
-    @cached_property
     def lean(self) -> float:
         """How much higher the center of mass is at the start than where the object would rest on its next face, with
         the same side up [m]; 0 if the mesh is unknown or flat, or no face is near."""
@@ -404,7 +385,7 @@ def likeliest_cause(r: Recording) -> tuple[str, bool]:
     if text := _best(r, _conventions(r), must_improve=not r.is_wrong):
         return text, True
     for cause in _places(r):
-        if _fits(cause.recording, r, r.slip() * 1.1 + 0.02):
+        if _fits(cause.recording, r.slip() * 1.1 + 0.02):
             return cause.text, False
     return _advice(r), False
 
@@ -413,7 +394,7 @@ def unnoticed_cause(r: Recording) -> str:
     """Return the cause of a recording without contradictions whose hand and object fit far better after a change; empty
     if there is none."""
     if np.isnan(r.slip()):
-        found = (c.text for c in _units(r) if _fits(c.recording, r, _TOGETHER))
+        found = (c.text for c in _units(r) if _fits(c.recording, _TOGETHER))
         return next(found, "")
     return _best(r, chain(_clocks(r), _orders(r), _inverses(r)), must_improve=True)
 
@@ -428,7 +409,7 @@ def _best(r: Recording, causes: Iterable[Cause], *, must_improve: bool) -> str:
     best = ""
     for cause in causes:
         other = cause.recording
-        if not _fits(other, r, r.slip() * 1.1 + 0.02):
+        if not _fits(other, r.slip() * 1.1 + 0.02):
             continue
         if must_improve and other.misfit > cause.better * r.misfit:
             continue
@@ -438,12 +419,9 @@ def _best(r: Recording, causes: Iterable[Cause], *, must_improve: bool) -> str:
     return best
 
 
-def _fits(other: Recording, r: Recording, slip: float) -> bool:
+def _fits(other: Recording, slip: float) -> bool:
     """Return whether a changed recording has no contradiction and slips at most so much."""
-    if not (np.isnan(slip) or other.slip() <= slip):
-        return False
-    leans = other.falls and not r.falls
-    return not leans and not other.contradictions
+    return bool(np.isnan(slip) or other.slip() <= slip) and not other.contradictions
 
 
 def _conventions(r: Recording) -> Iterator[Cause]:

@@ -9,6 +9,7 @@ import torch
 from numpy.testing import assert_allclose, assert_array_equal
 
 from tests import toy_grasp
+from tests.data import refuses
 from xreset.eval.robot_loop import SimulatedRunner
 from xreset.eval.rollout import engine, episode_starts
 from xreset.learning.recipes import RECIPES
@@ -112,6 +113,7 @@ class FaultTest(TestCase):
         self.assertLess(abs(moves[-1, 0]), 0.001)
         slowing = (moves[:, 0] > 1e-6) & (moves[:, 0] < 0.0099)
         self.assertLessEqual(slowing.sum() * Steady.dt, 0.26)
+        self.assertGreater(slowing.sum() * Steady.dt, 0.15)
         assert_array_equal(moves[-10:, 1], 0)  # a target that may jump stays
         return outcome.reason
 
@@ -125,6 +127,7 @@ class FaultTest(TestCase):
             ("no rotation", after(1, object_quat=np.zeros(4)), "old: newer ones hold numbers .* no unit quaternion"),
             ("no pose at all", after(0, object_pos=nan), "old: newer ones hold numbers"),
             ("NaN joint", after(1, joint_pos=np.array([0, np.nan])), "joint positions are 0.1. s old: newer ones"),
+            ("NaN velocity", after(1, joint_vel=np.array([0, np.nan])), "joint positions are 0.1. s old: newer ones"),
             ("joint clock back", after(1, joint_time=lambda t, r: 2 - t), "joint positions are 0.1. s old: newer ones"),
             ("joint clock ahead", after(1, joint_time=lambda t, r: t + 60), "joint positions are 0.1. s old: newer ones"),
             ("old joints", after(1, joint_time=0.99), "joint positions are 0.1. s old"),
@@ -135,6 +138,7 @@ class FaultTest(TestCase):
             ("no pose", after(1, object_pos=None), "object_pos is None. Without a new value, give the last one"),
             ("millimetres", after(1, object_pos=np.array([500, 0, 100])), "old: newer ones hold .* more than 10 m"),
             ("one joint", after(1, joint_pos=np.zeros(1)), r"could not read: joint_pos has shape \(1, 1\), expected \(1, 2\)\.$"),
+            ("times", after(1, joint_time=np.zeros(1)), r"joint_time has shape \(1, 1\), expected \(1,\)\.$"),
             ("no cable", lambda t, r: refuse() if t > 1 else r, "The driver could not read: the cable is out"),
         ):  # fmt: skip
             with self.subTest(name), self.assertLogs("xreset", "WARNING") as logs:
@@ -146,9 +150,50 @@ class FaultTest(TestCase):
                 self.assertRegex(self.stopped(Scripted(fault)), words)
                 self.assertEqual(len(logs.output), 1)
 
+    def test_a_driver_may_use_its_arrays_again(self):
+        """A tracker writes into its own array, and the robot counts its first joint the other way."""
+        pose = np.array([0.5, 0.0, 0.1], np.float32)
+        far = []
+
+        def fault(time, reading):
+            pose[0] = 50.0 if 1 < time < 1.5 else 0.5
+            return replace(reading, object_pos=pose)
+
+        class Noting(Steady):
+            def step(self, reading):
+                far.append(reading.object_pos.max())
+                return super().step(reading)
+
+        driver = Scripted(fault)
+        send = driver.send
+
+        def turned(target):
+            send(target.copy())
+            target[0] *= -1
+
+        driver.send = turned
+        self.assertIsNone(Runner(Noting(), driver, Limits(target_speed=0.5)).run(2).reason)
+        self.assertLess(max(far), 1)
+        assert_allclose(np.diff(driver.sent, axis=0)[:, 0], 0.006, rtol=1e-4)
+
+    def test_a_second_run_knows_nothing_of_the_first(self):
+        driver = Scripted()
+        controller = Steady()
+        runner = Runner(controller, driver)
+        runner.run(1)
+        controller.target = np.zeros((1, 2), np.float32)  # another episode
+        count = len(driver.sent)
+        driver.fault = after(0, object_time=0.98)
+        self.assertEqual(runner.run(0.5).steps, 25)
+        driver.fault = after(0, object_time=-1.0)
+        self.assertEqual(runner.run(0.5).steps, 0)
+        assert_allclose(driver.sent[count], 0.01)
+        self.assertEqual(len(driver.sent), count + 25)
+
     def test_joints_slightly_beyond_their_limits_are_tolerated(self):
         driver = Scripted(after(0, joint_pos=np.array([-1.09, 9.09])))
-        self.assertIsNone(Runner(Steady(), driver).run(1).reason)
+        outcome = Runner(Steady(), driver).run(0.2)
+        self.assertEqual((outcome.reason, outcome.steps), (None, 10))
 
     def test_targets_are_no_faster_than_their_limit(self):
         driver = Scripted()
@@ -164,8 +209,9 @@ class FaultTest(TestCase):
         controller = Steady()
         with self.assertRaisesRegex(LiveError, "no output 'links', which a workspace needs"):
             Runner(controller, Scripted(), Limits(workspace=((0, 0, 0), (1, 1, 1))))
-        with self.assertRaisesRegex(LiveError, "expected the lowest and the highest corner"):
-            Limits(workspace=((0, 0, 0), (1, 1, 0)))
+        for box in (((0, 0, 0), (1, 1, 0)), ((0, 0), (1, 1)), (0, 1)):
+            with refuses(self, "expected the lowest and the highest corner", LiveError, str(box)):
+                Limits(workspace=box)
         controller.outputs = ("target", "links")
         controller.contract = {**Steady.contract, "links": ["palm", "tip"]}
 
@@ -174,23 +220,29 @@ class FaultTest(TestCase):
             return target + 0.01
 
         controller.act = act
-        for limit, words in (
-            (0.4, "palm is at (0.50, 0.50, 0.50)"),
-            (0.6, "tip is at (0.61, 0.50"),
+        for lowest, highest, words in (
+            (-1, 0.4, "palm is at (0.50, 0.50, 0.50)"),
+            (0.1, 1.0, "tip is at (0.00, 0.50"),
+            (-1, 0.6, "tip is at (0.61, 0.50"),
         ):
             driver = Scripted()
             controller.target *= 0
-            limits = Limits(workspace=((-1, 0, 0), (limit, 1, 1)))
+            limits = Limits(workspace=((lowest, 0, 0), (highest, 1, 1)))
             self.assertIn(words, self.reason(driver, controller, limits))
         self.assertLess(driver.sent[-1][0], 0.7)
 
     def test_resting_targets_are_sent_as_long_as_the_robot_holds(self):
-        driver = Scripted(after(1, object_time=0.99))
-        reason = self.reason(driver, limits=Limits(hold=3.0))
+        start = 1.7e9  # as ROS counts
+        driver = Scripted(after(start + 1, object_time=start + 0.99))
+        driver.time = start
+        controller = Steady()
+        controller.upper = np.array([1.02, 9.0], np.float32)
+        reason = self.reason(driver, controller, limits=Limits(hold=3.0))
         self.assertIn("pose of the object", reason)
+        assert_allclose(np.max(driver.sent, axis=0)[0], 1.02)
         moves = np.diff(driver.sent, axis=0)
         assert_array_equal(moves[-150:], 0)
-        self.assertGreater(driver.time, 5.2)
+        self.assertGreater(driver.time, start + 5.2)
 
     def test_old_data_at_the_start_move_nothing(self):
         for name, words in (
@@ -207,7 +259,9 @@ class FaultTest(TestCase):
         self.assertEqual((driver.sent, driver.stops), ([], 1))
 
         def late(time, reading):
-            return reading if time > 2.5 else replace(reading, object_time=-5.0)
+            joint_time = -5.0 if time < 2.05 else time
+            object_time = -5.0 if time <= 2.5 else time
+            return replace(reading, joint_time=joint_time, object_time=object_time)
 
         driver = Scripted(late)
         runner = Runner(Steady(), driver)
@@ -219,6 +273,10 @@ class FaultTest(TestCase):
         for name, value in (("pose_age", float("nan")), ("slow_down", -1.0)):
             with self.assertRaisesRegex(LiveError, f"{name} is {value}, expected 0 or more"):
                 Limits(**{name: value})
+        with self.assertRaisesRegex(LiveError, "slow_down is inf, expected a finite time"):
+            Limits(slow_down=np.inf)
+        driver = Scripted(after(0, object_pos=np.full(3, 50.0)))
+        self.assertEqual(Runner(Steady(), driver, Limits(pose_age=np.inf)).run(1).steps, 0)
         driver = Scripted(after(1, object_time=0.99))
         for name in ("joint_speed", "target_speed"):
             with self.assertRaisesRegex(LiveError, f"{name} is 0, expected a share above 0"):
@@ -238,7 +296,7 @@ class FaultTest(TestCase):
             return Steady(act)
 
         for result, words in (
-            (lambda target: target * np.nan, "The policy gave numbers that are not finite"),
+            (lambda target: target * [1, np.nan], "The policy gave numbers that are not finite"),
             (refuse, "The policy could not act: the cable is out"),
         ):
             calls.clear()
@@ -304,10 +362,19 @@ class FaultTest(TestCase):
                 return replace(reading, object_time=1.0)
             if round(time / 0.02) % 7 == 0:
                 return replace(reading, object_pos=np.full(3, np.nan))
+            if round(time / 0.02) % 7 == 3:  # an earlier pose, which the last one has overtaken
+                return replace(reading, object_pos=np.ones(3), object_time=time - 0.8)
             return replace(reading, object_time=time - 0.2)
 
+        class Noting(Steady):
+            def step(self, reading):
+                highest.append(reading.object_pos[0, 2])
+                return super().step(reading)
+
+        highest = []
         driver = Scripted(fault)
-        outcome = Runner(Steady(), driver).run(3)
+        outcome = Runner(Noting(), driver).run(3)
+        self.assertLess(max(highest), 0.5)
         self.assertIsNone(outcome.reason)
         self.assertGreater(outcome.refused[0], 10)
         self.assertEqual((len(driver.sent), driver.stops), (149, 1))  # the first pose is faulty

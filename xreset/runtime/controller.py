@@ -152,7 +152,7 @@ class Controller:
                 another length than 1, or ``center`` is missing. No episode goes on then.
         """
         self._has_begun = False
-        given = np.atleast_2d(np.asarray(target, dtype=np.float32))
+        given = np.atleast_2d(np.array(target, dtype=np.float32))
         joints = len(self.contract["joints"])
         if given.ndim != 2 or given.shape[1] != joints:
             raise LiveError(f"target has shape {np.shape(target)}, expected ({joints},).")
@@ -184,9 +184,7 @@ class Controller:
         self._set_goal(pos, quat)
 
     def _set_goal(self, pos: Array, quat: Array) -> None:
-        goal_quat = self._of_each("goal_quat", quat, 4)
-        if not is_unit(goal_quat).all():
-            raise LiveError(f"The goal has {quat}, expected a unit quaternion (w, x, y, z).")
+        goal_quat = self._orientations("goal_quat", quat)
         self._given["goal_pos"] = self._positions("goal_pos", pos, 3)
         self._given["goal_quat"] = goal_quat
 
@@ -195,8 +193,8 @@ class Controller:
             raise LiveError("No episode has begun. Call begin first.")
 
     def _of_each(self, what: str, values: Array, *shape: int) -> Array:
-        """[N, ...] values of every robot in float32, given those [N, ...] or one robot's [...]."""
-        array = np.asarray(values, np.float32)
+        """[N, ...] copy of every robot's values in float32, given those [N, ...] or one robot's [...]."""
+        array = np.array(values, np.float32)
         try:
             return np.broadcast_to(array, (len(self.target), *shape))
         except ValueError:
@@ -211,6 +209,13 @@ class Controller:
                 f"{what} has the coordinate {farthest:g}, expected at most {REACH:g} m. Are these millimetres?"
             )
         return positions
+
+    def _orientations(self, what: str, values: Array) -> Array:
+        """[N, 4] quaternions, as :meth:`_of_each`; ``LiveError`` if one has another length than 1."""
+        quat = self._of_each(what, values, 4)
+        if not is_unit(quat).all():
+            raise LiveError(f"{what} is {values}, expected a unit quaternion (w, x, y, z).")
+        return quat
 
     def _check_joints(self, what: str, values: Array) -> None:
         """Raise ``LiveError`` if a value [N, J] is far beyond the limits of its joint, or not finite."""
@@ -231,8 +236,10 @@ class Controller:
         """
         self._must_have_begun()
         reading = reading.batched()
-        self._check_joints("joint_pos", reading.joint_pos)
+        joints = self._of_each("joint_pos", reading.joint_pos, len(self.lower))
+        self._check_joints("joint_pos", joints)
         self._positions("The object", reading.object_pos, 3)
+        self._orientations("object_quat", reading.object_quat)
         for name, unit, most in (("joint_vel", "rad/s", _FASTEST), ("tip_force", "N", _STRONGEST)):
             values = getattr(reading, name)
             largest = 0.0 if values is None else np.abs(values).max(initial=0.0)
@@ -327,6 +334,12 @@ class Controller:
         target = self.step(reading)
         if target.shape != (1, len(joints)) or not np.isfinite(target).all():
             raise ValueError(f"the targets at home are {target}")
+        links = len(self.contract.get("links", ()))
+        if self.links is not None and self.links.shape != (1, links, 3):
+            raise ValueError(f"links has shape {self.links.shape}, expected (1, {links}, 3)")
+        if (_MEMORY in self.shapes) != ("memory_out" in self.outputs):
+            raise ValueError("it has only one of memory_in and memory_out")
+        self.step(reading)  # with the memory of the first step
         self._has_begun = False
         for name, entry in self.contract.get("objects", {}).items():
             if "object_points" in self.shapes:

@@ -40,13 +40,12 @@ class Reading:
     tip_force: Array | None = None
 
     def batched(self) -> Reading:
-        """Return the reading with the axis N, in float32 (times: float64).
+        """Return a copy with the axis N, in float32 (times: float64). Drivers may go on to use their own arrays.
 
         Raises:
             ValueError: data that no robot may leave out are None.
         """
-        if np.ndim(self.joint_pos) == 2:
-            return self
+        has_axis = np.ndim(self.joint_pos) == 2
         rows = {}
         for name, value in vars(self).items():
             if value is None and name not in ("joint_vel", "tip_force"):
@@ -55,7 +54,8 @@ class Reading:
                 )
             if value is not None:
                 dtype = np.float64 if name.endswith("_time") else np.float32
-                rows[name] = np.asarray(value, dtype=dtype)[None]
+                row = np.array(value, dtype=dtype)
+                rows[name] = row if has_axis else row[None]
         return Reading(**rows)
 
 

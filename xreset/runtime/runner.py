@@ -50,7 +50,10 @@ class Limits:
             # a joint without a speed limit has the limit infinity, and no share of it
             if entry.name in ("joint_speed", "target_speed") and value == 0:
                 raise LiveError(f"{entry.name} is 0, expected a share above 0.")
-        if self.workspace is not None and not np.less(*self.workspace).all():
+        if self.slow_down == np.inf:
+            raise LiveError("slow_down is inf, expected a finite time [s].")
+        box = self.workspace
+        if box is not None and (np.shape(box) != (2, 3) or not np.less(*box).all()):
             raise LiveError(
                 f"workspace is {self.workspace}, expected the lowest and the highest corner of a box [m]."
             )
@@ -63,7 +66,7 @@ class Outcome:
     Attributes:
         reasons: [N] why each robot was stopped; None: the time was over.
         steps: control steps that the policy took.
-        missed: control steps that were skipped because the step before took too long.
+        missed: control steps that began late because the step before took too long.
         refused: [N] poses that were not used: not finite, far away, or with a time stamp that ran backwards.
     """
 
@@ -115,19 +118,27 @@ class Runner:
         self.controller = controller
         self.driver = driver
         self.limits = limits or Limits()
-        count = len(controller.target)
+        self._prepare()
+
+    def _prepare(self) -> None:
+        """Forget an earlier run: its data are old, and the controller may have begun another episode."""
+        count = len(self.controller.target)
         self.outcome = Outcome(reasons=[None] * count, refused=np.zeros(count, dtype=int))
         self._stopped_at = np.full(count, np.inf)
         self._reading: Reading | None = None
         self._one_robot = False  # whether the driver's arrays have no axis N
         self._refusals = np.full(count, _NO_NEWER, dtype=object)
         """[N] why no newer pose is used."""
-        self._sent = controller.target
+        self._sent = self.controller.target
         self._move = np.zeros_like(self._sent)
         self._begun = -np.inf
 
     def run(self, seconds: float = float("inf")) -> Outcome:
-        """Run until the time is over, until every robot has stopped, or until Ctrl-C; then stop the driver."""
+        """Run until the time is over, until every robot has stopped, or until Ctrl-C; then stop the driver.
+
+        After a fault and after Ctrl-C the targets slow down first.
+        """
+        self._prepare()
         self._begun = self.driver.now()
         try:
             self._loop(self._begun + seconds - self.controller.dt / 2)
@@ -180,8 +191,9 @@ class Runner:
         self._sent = np.where(running, target, self._slowed(now))
         if not self.outcome.steps:
             return True  # the targets of begin may be far from where the robot is
+        sent = self._sent.copy()
         try:
-            self.driver.send(self._sent[0] if self._one_robot else self._sent)
+            self.driver.send(sent[0] if self._one_robot else sent)
         except Exception as error:
             self._stop_all(f"The driver could not send targets: {_sentence(error)}")
             return False
@@ -215,6 +227,7 @@ class Runner:
         running = self._running
         is_new = np.asarray(now - reading.object_time <= self.limits.pose_age)
         is_new &= now - reading.joint_time <= self.limits.joint_age
+        is_new &= np.isfinite(reading.object_time + reading.joint_time)  # some were sound
         if not running.any() or not is_new[running].all():
             return self._sent
         try:
@@ -247,11 +260,12 @@ class Runner:
     def _check_shapes(self, reading: Reading) -> None:
         """Raise ``LiveError`` if a reading has not as many numbers as the robot."""
         robots, joints = self._sent.shape
-        shapes = {"joint_pos": joints, "joint_vel": joints, "object_pos": 3, "object_quat": 4}
-        for name, count in shapes.items():
+        one: dict[str, tuple[int, ...]] = {"joint_pos": (joints,), "joint_vel": (joints,)}
+        one |= {"object_pos": (3,), "object_quat": (4,), "joint_time": (), "object_time": ()}
+        for name, shape in one.items():
             value = getattr(reading, name)
-            if value is not None and value.shape != (robots, count):
-                raise LiveError(f"{name} has shape {value.shape}, expected {(robots, count)}.")
+            if value is not None and value.shape != (robots, *shape):
+                raise LiveError(f"{name} has shape {value.shape}, expected {(robots, *shape)}.")
 
     def _merged(self, new: Reading, now: float) -> Reading:
         """Return a reading with the last sound values in place of its faulty ones."""

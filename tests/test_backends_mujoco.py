@@ -245,6 +245,7 @@ class BothBackends(TestCase):
         for changes, words in (
             ({"robot": "openarm"}, "robot is 'openarm', expected a RobotSpec: xreset.load_robot"),
             ({"objects": ["soup"]}, "objects has 'soup', expected an ObjectSpec"),
+            ({"objects": None}, "objects has None, expected an ObjectSpec"),
             ({"timestep": 0}, "timestep is 0, expected a number above 0"),
         ):
             with refuses(self, words, XResetError):

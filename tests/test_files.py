@@ -1,5 +1,6 @@
 """Files: whole or not at all, checked before use; typed configuration; the reset bank's refusals."""
 
+import io
 import json
 import os
 import re
@@ -431,6 +432,20 @@ class NpzTest(InFolder):
         ):
             self.read()
         with patch.dict(os.environ, XRESET_MAX_FILE_MB="10"):
+            self.read()
+        self.write()
+        with zipfile.ZipFile(self.file) as file:
+            members = {name: file.read(name) for name in file.namelist()}
+        content = io.BytesIO()
+        np.save(content, np.zeros(10 << 20, np.uint8))
+        with zipfile.ZipFile(self.file, "w", zipfile.ZIP_DEFLATED) as file:
+            for name, member in {"points": content.getvalue(), **members}.items():
+                file.writestr(name, member)
+        with (
+            patch.dict(os.environ, XRESET_MAX_FILE_MB="9"),
+            limited_memory(self, 5),
+            self.refused("take 10 MB unpacked, the largest is 'points'"),
+        ):
             self.read()
         self.write(offsets=np.zeros(1_500_000, dtype=np.int8))  # becomes int64
         with patch.dict(os.environ, XRESET_MAX_FILE_MB="9"), self.refused("take 11 MB unpacked"):

@@ -93,8 +93,9 @@ class OnnxPolicyTest(WithPolicy):
         )
         with self.assertRaises(PolicyError):
             OnnxPolicy(path)
-        with self.assertRaisesRegex(PolicyError, "here is no policy file"):
-            OnnxPolicy(self.folder / "none.onnx")
+        for name in ("none.onnx", f"{'long' * 100}.onnx"):
+            with refuses(self, "there is no .*onnx.* .policy.", PolicyError, name):
+                OnnxPolicy(self.folder / name)
         path.write_bytes(b"hello")
         self.assertRaisesRegex(PolicyError, "cannot be read as an ONNX policy", OnnxPolicy, path)
         (other := self.folder / "demos.npz").write_bytes(b"hello")

@@ -351,7 +351,7 @@ def checked_objects(robot: Any, objects: Any) -> tuple[ObjectSpec, ...]:
             f"robot is {shown(robot)}, expected a RobotSpec: xreset.load_robot(NAME)."
         )
     found: tuple[Any, ...] = (objects,)
-    if not isinstance(objects, ObjectSpec | str):
+    if isinstance(objects, Iterable) and not isinstance(objects, str):
         found = tuple(objects)
     for obj in found:
         if not isinstance(obj, ObjectSpec):

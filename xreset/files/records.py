@@ -241,10 +241,11 @@ def _opened(
     at damage becomes one error."""
     must_exist(path, what)
     try:
+        sizes: dict[str, int] = {}
         with zipfile.ZipFile(path) as file:
-            sizes = {
-                member.filename.removesuffix(".npy"): member.file_size for member in file.infolist()
-            }
+            for member in file.infolist():  # NAME and NAME.npy are the same array
+                name = member.filename.removesuffix(".npy")
+                sizes[name] = max(member.file_size, sizes.get(name, 0))
         with np.load(path, allow_pickle=False) as arrays:
             yield arrays, sizes
     except XResetError:

@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from xreset.errors import PolicyError, RobotError, WrongValueError, needs
+from xreset.errors import FileFormatError, PolicyError, RobotError, WrongValueError, needs
 from xreset.files.checks import parsed
-from xreset.files.storage import code_version, max_bytes, parse_json
+from xreset.files.storage import code_version, max_bytes, must_exist, parse_json
 from xreset.files.text import shown
 from xreset.spec import RobotSpec
 from xreset.task.config import TaskConfig
@@ -249,9 +249,11 @@ def picture_shape(task: TaskConfig) -> tuple[int, ...]:
 
 
 def policy_content(path: Path) -> bytes:
-    """Return the content of a policy's file; ``PolicyError`` if there is none, or it is too large."""
-    if not path.is_file():
-        raise PolicyError(f"There is no policy file {path}.")
+    """Return the content of a policy's file; ``PolicyError`` if it cannot be read, or is too large."""
+    try:
+        must_exist(path, "policy")
+    except FileFormatError as error:
+        raise PolicyError(str(error)) from error
     if path.stat().st_size > max_bytes():
         raise PolicyError(
             f"{path} has {path.stat().st_size >> 20} MB, more than XRESET_MAX_FILE_MB allows."

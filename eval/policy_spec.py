@@ -13,7 +13,7 @@ from xreset.files.checks import Checked, Seed, frozen, obeys_rules
 from xreset.files.text import Brief, shown
 from xreset.geometry.description import load_robot
 from xreset.learning.exported import PolicyFile, find_policy
-from xreset.live.deploy import deployed_graph, is_deployed, made_for, training_of
+from xreset.live.deploy import check_made_for, deployed_graph, is_deployed, made_for, training_of
 from xreset.objects.catalogue import object_names
 from xreset.physics.plugins import robot_of_file
 from xreset.policy.onnx_policy import (
@@ -21,13 +21,12 @@ from xreset.policy.onnx_policy import (
     Policy,
     check_contract,
     check_robot_of,
-    of_another_robot,
 )
 from xreset.policy.shipped import graph_of, no_policy_for, shipped_name
 from xreset.resets.bank import ResetBank
 from xreset.retarget.file import Retargeted
 from xreset.runtime import Controller
-from xreset.spec import ObjectSpec, RobotSpec, first_difference
+from xreset.spec import ObjectSpec, RobotSpec
 from xreset.task.config import TaskConfig, evaluation_task
 from xreset.task.contract import Contract
 
@@ -222,14 +221,8 @@ def load_policy(policy: str | Path | PolicySpec, *, robot: str | Path | None = N
     spec = load_robot(robot)
     if not is_graph:
         check_robot_of(str(found.path), contract, spec)
-    elif contract.joint_names != spec.joint_names:
-        if contract.robot != spec.name:
-            raise of_another_robot(str(found.path), contract.robot, spec.name)
-        differs = first_difference(contract.joint_names, spec.joint_names)
-        raise PolicyError(
-            f"{found.path} is a policy of another version of {spec.name!r}: {differs}. Export the policy again, or "
-            "use the robot's former version."
-        )
+    else:
+        check_made_for(str(found.path), contract, spec)
     results = found.results
     if contract.task.joint_slots is not None and spec.name != contract.robot:
         results = results / spec.name  # not in place of the results of the policy's first robot

@@ -147,13 +147,17 @@ class ToyTest(InFolder):
         )  # fmt: skip
 
     def test_a_robot_with_other_joints_is_refused(self):
-        changed = replace(self.robot, joints=self.robot.joints[:-1])
-        words = "another version of 'conformance-gripper': joint_names.4. is '.*', here missing"
-        with (
-            mock.patch("xreset.eval.policy_spec.load_robot", return_value=changed),
-            self.assertRaisesRegex(PolicyError, words),
+        for changes, words in (
+            ({"joints": self.robot.joints[:-1]}, "joint_names.4. is '.*', here missing"),
+            ({"base_pos": (0.0, 0.0, 0.1)}, "its URDF, a mesh or robot.toml has changed"),
         ):
-            load_policy(self.out / "policy.onnx", robot="changed")
+            changed = replace(self.robot, **changes)
+            words = f"another version of 'conformance-gripper': {words}"
+            with (
+                mock.patch("xreset.eval.policy_spec.load_robot", return_value=changed),
+                refuses(self, words, PolicyError),
+            ):
+                load_policy(self.out / "policy.onnx", robot="changed")
 
     def test_the_graph_says_what_goes_in_and_out(self):
         model = onnx.load_from_string(self.graph)
@@ -222,6 +226,8 @@ class ToyTest(InFolder):
             ("joint_vel", [3e38] * 5, r"joint_vel holds 3e\+38, expected at most 100 rad/s"),
             ("object_pos", [500.0, 0, 0], "The object has the coordinate 500.*millimetres"),
             ("tip_force", [[1e6, 0, 0]] * 2, "tip_force holds 1e.06"),
+            ("joint_pos", self.home[1:], r"joint_pos has shape \(1, 4\), expected \(5,\)"),
+            ("object_quat", [1, 0, 0, 1], "object_quat is .* expected a unit quaternion"),
         ):
             with refuses(self, words, LiveError, name):
                 controller.check_reading(replace(reading, **{name: value}))
@@ -264,6 +270,9 @@ class ToyTest(InFolder):
     def test_another_version_and_damage_are_refused(self):
         fewer = self.changed(("joints",), self.contract["joints"][1:])
         few_points = self.changed(("objects", "brick", "points"), [[0, 0, 0]] * 63)
+        no_links = self.changed(("links",), [])
+        forgetful = onnx.load_from_string(self.graph)
+        del forgetful.graph.output[1]
         for content, words in (
             (self.network.read_bytes(), "no metadata entry 'xreset-deploy': it is not a deployed"),
             (
@@ -275,6 +284,8 @@ class ToyTest(InFolder):
             (b"", "It cannot be read as ONNX"),
             (self.with_metadata(fewer), "has the input 'joint_pos'"),
             (self.with_metadata(few_points), "points"),
+            (self.with_metadata(no_links), r"links has shape \(1, 3, 3\), expected \(1, 0, 3\)"),
+            (forgetful.SerializeToString(), "only one of memory_in and memory_out"),
         ):
             with refuses(self, words, LiveError):
                 Controller(content, "It")
@@ -523,6 +534,10 @@ class RefusedTest(TestCase):
         seeing = TaskConfig(vision=VisionConfig(cameras=(CameraConfig(),)))
         with self.assertRaisesRegex(PolicyError, "The policy has cameras"):
             policy_graph(b"", robot, seeing)
+        for network in (b"hello", "mine.onnx"):
+            words = f"network is {network!r}, expected the content of an ONNX file"
+            with refuses(self, words, PolicyError):
+                deployed_graph(network, robot, TaskConfig())
         network = torch.nn.Linear(1, 1)
         for name in ("object_linvel", "reward", "least_tip_distance"):
             draft = ObservationConfig()

@@ -119,10 +119,12 @@ class PlayedTest(InOneFolder):
         cls.env = StableBaselinesEnv(make_env(robot, (soup,), bank, task, num_envs=1))
         cls.addClassCleanup(cls.env.close)
         cls.model = PPO("MultiInputPolicy", cls.env, n_steps=2, batch_size=2, device="cpu", seed=0)
-        cls.graph = deployed_graph(Network(cls.model), robot, task, (soup,))
+        cls.network = Network(cls.model)
+        cls.graph = deployed_graph(cls.network, robot, task, (soup,))
 
     def test_the_graph_gives_the_targets_of_the_policy(self):
         self.assertNotIn("privileged", self.env.observation_space)
+        self.assertTrue(self.network.training, "its learner may go on")
         graph = GraphPolicy(Controller(self.graph))
         world = self.env.env
         world.reset()

@@ -21,12 +21,13 @@ from xreset.policy.onnx_policy import (
     METADATA_KEY,
     VERSION_KEY,
     contract_metadata,
+    of_another_robot,
     parsed_contract,
     policy_contract,
 )
 from xreset.runtime import Controller
 from xreset.runtime.contract import KEY, POLICY, SCHEMA, check_contract
-from xreset.spec import ObjectSpec, RobotSpec
+from xreset.spec import ObjectSpec, RobotSpec, first_difference
 from xreset.task.config import EVALUATION_TIMESTEP, ActionConfig, TaskConfig
 from xreset.task.contract import SCHEMA as TRAINED
 from xreset.task.contract import Contract
@@ -166,6 +167,30 @@ def deployed_graph(
     return model.SerializeToString()
 
 
+def check_made_for(source: str, contract: Contract, robot: RobotSpec) -> None:
+    """Refuse to play a deployed policy on another robot, whose kinematics its graph does not have.
+
+    Args:
+        source: name of the policy in messages.
+        contract: as of :func:`training_of`.
+        robot: the robot that shall play it.
+
+    Raises:
+        PolicyError: the robot has other joints, or another description than the policy states.
+    """
+    differs = first_difference(contract.joint_names, robot.joint_names)
+    stated = contract.robot_fingerprint
+    if not differs and stated not in ("", robot.like) and not robot.has_fingerprint(stated):
+        differs = "its URDF, a mesh or robot.toml has changed"
+    if differs and contract.robot != robot.name:
+        raise of_another_robot(source, contract.robot, robot.name)
+    if differs:
+        raise PolicyError(
+            f"{source} is a policy of another version of {robot.name!r}: {differs}. Export the policy again, or use "
+            "the robot's former version."
+        )
+
+
 def made_for(graph: bytes, robot: RobotSpec) -> bool:
     """Return whether a deployed policy was made for a robot with this description, in the same place."""
     return Controller(graph).contract.get("robot_fingerprint") == robot.fingerprint
@@ -222,7 +247,7 @@ def training_of(controller: Controller, source: str) -> Contract:
     return Contract(
         schema=TRAINED,
         robot=stated["robot"],
-        robot_fingerprint=str(stated.get("robot_fingerprint")),
+        robot_fingerprint=str(stated.get("robot_fingerprint", "")),
         joint_names=tuple(joint["name"] for joint in stated["joints"]),
         fingertip_names=tuple(stated.get("fingertips", ())),
         objects=listed,

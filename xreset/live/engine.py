@@ -12,8 +12,8 @@ from torch import Tensor
 
 from xreset.env.manipulation import ManipulationEnv
 from xreset.geometry.rotations import quat_rotate
+from xreset.live.deploy import check_made_for, training_of
 from xreset.objects.sampling import center, surface_points
-from xreset.policy.onnx_policy import of_another_robot
 from xreset.runtime import Controller, Driver, Reading
 
 
@@ -116,11 +116,9 @@ class GraphPolicy:
         self._controller = controller
 
     def begin(self, env: ManipulationEnv) -> None:
-        """Begin an episode in every world; ``PolicyError`` if the policy has other joints than the robot."""
-        contract = self._controller.contract
-        robot = env.backend.scene.robot
-        if tuple(joint["name"] for joint in contract["joints"]) != robot.joint_names:
-            raise of_another_robot("The graph", contract["robot"], robot.name)
+        """Begin an episode in every world; ``PolicyError`` if the policy is of another robot."""
+        contract = training_of(self._controller, "The graph")
+        check_made_for("The graph", contract, env.backend.scene.robot)
         self._env = env
         self._driver = EngineDriver(env)
         self._center = torch.as_tensor(centers(env), device=env.device)

@@ -10,6 +10,7 @@ memory.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from copy import deepcopy
 from math import prod
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +19,7 @@ import torch
 from torch import Tensor, nn
 
 from xreset.errors import PolicyError, needs
+from xreset.files.text import shown
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import matrix_to_quat, quat_rotate
 from xreset.physics import Links, State
@@ -199,11 +201,16 @@ def policy_graph(network: bytes | nn.Module, robot: RobotSpec, task: TaskConfig)
         raise PolicyError(
             "The policy has cameras, which the runtime does not support. Use a policy without cameras."
         )
-    if isinstance(network, bytes):
-        # networks that were not exported by torch may not state the shapes of their outputs
-        middle = onnx.shape_inference.infer_shapes(onnx.load_from_string(network))
-    else:
+    if isinstance(network, nn.Module):
         middle = _exported_module(network, robot, task)
+    else:
+        try:
+            # networks that were not exported by torch may not state the shapes of their outputs
+            middle = onnx.shape_inference.infer_shapes(onnx.load_from_string(network))
+        except Exception as error:  # of the parser, which takes any object
+            raise PolicyError(
+                f"network is {shown(network)}, expected the content of an ONNX file, or a module of torch ({error})."
+            ) from error
     middle = _prefixed(middle, "network/")
     wanted = [value.name.removeprefix("network/") for value in middle.graph.input]
     widths = [value.type.tensor_type.shape.dim[2].dim_value for value in middle.graph.input[2:]]
@@ -316,6 +323,7 @@ def _prefixed(model: ModelProto, prefix: str) -> ModelProto:
 
 def _exported_module(network: nn.Module, robot: RobotSpec, task: TaskConfig) -> ModelProto:
     """Return a memoryless network of any learner as an ONNX model."""
+    network = deepcopy(network).cpu().eval()  # the learner goes on with its own
     observe = Observe(robot, task, ())
     zeros = [torch.zeros(_EXAMPLES, *shape) for shape in _input_shapes(robot, task).values()]
     with torch.no_grad():
@@ -328,4 +336,4 @@ def _exported_module(network: nn.Module, robot: RobotSpec, task: TaskConfig) -> 
             f"The network gives {found} for observations {tuple(flat.shape)} and clouds {tuple(cloud.shape)}, expected "
             f"actions {expected}."
         )
-    return exported_module(network.eval(), {"flat": flat, "cloud": cloud}, ["actions"], opset=OPSET)
+    return exported_module(network, {"flat": flat, "cloud": cloud}, ["actions"], opset=OPSET)

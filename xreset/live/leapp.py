@@ -43,7 +43,7 @@ def leapp_description(graph: bytes) -> str:
         "links": (len(contract.get("links", ())), 3),
         "observations": () if observed is None else observed.shape[1:],
     }
-    outputs = {name: shapes[name] for name in controller.outputs}
+    outputs = {name: shapes[name] for name in controller.outputs if name in shapes}
     feedback = {f"{_NODE}/memory_out": [f"{_NODE}/memory_in"]} if "memory_out" in outputs else {}
 
     def described(name: str, shape: tuple[int, ...]) -> dict[str, Any]:

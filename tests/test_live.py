@@ -79,6 +79,18 @@ class Steady:
         return self.target
 
 
+class Noting(Steady):
+    """It notes the readings that it acts on."""
+
+    def __init__(self):
+        super().__init__()
+        self.readings = []
+
+    def step(self, reading):
+        self.readings.append(reading)
+        return super().step(reading)
+
+
 def after(moment, **changes):
     """A fault from that time on: values, or functions of (time, reading)."""
 
@@ -153,18 +165,13 @@ class FaultTest(TestCase):
     def test_a_driver_may_use_its_arrays_again(self):
         """A tracker writes into its own array, and the robot counts its first joint the other way."""
         pose = np.array([0.5, 0.0, 0.1], np.float32)
-        far = []
 
         def fault(time, reading):
             pose[0] = 50.0 if 1 < time < 1.5 else 0.5
             return replace(reading, object_pos=pose)
 
-        class Noting(Steady):
-            def step(self, reading):
-                far.append(reading.object_pos.max())
-                return super().step(reading)
-
         driver = Scripted(fault)
+        controller = Noting()
         send = driver.send
 
         def turned(target):
@@ -172,8 +179,8 @@ class FaultTest(TestCase):
             target[0] *= -1
 
         driver.send = turned
-        self.assertIsNone(Runner(Noting(), driver, Limits(target_speed=0.5)).run(2).reason)
-        self.assertLess(max(far), 1)
+        self.assertIsNone(Runner(controller, driver, Limits(target_speed=0.5)).run(2).reason)
+        assert_allclose([reading.object_pos[0, 0] for reading in controller.readings], 0.5)
         assert_allclose(np.diff(driver.sent, axis=0)[:, 0], 0.006, rtol=1e-4)
 
     def test_a_second_run_knows_nothing_of_the_first(self):
@@ -189,6 +196,27 @@ class FaultTest(TestCase):
         self.assertEqual(runner.run(0.5).steps, 0)
         assert_allclose(driver.sent[count], 0.01)
         self.assertEqual(len(driver.sent), count + 25)
+
+    def test_a_robot_stops_while_another_goes_on(self):
+        def fault(time, reading):
+            pos = driver.sent[-1] if driver.sent else np.zeros((2, 2))
+            return Reading(
+                joint_pos=pos,
+                joint_time=np.full(2, time),
+                object_pos=[reading.object_pos] * 2,
+                object_quat=[reading.object_quat] * 2,
+                object_time=np.array([time, min(time, 1.0)]),
+            )
+
+        driver = Scripted(fault)
+        controller = Steady()
+        controller.target = np.zeros((2, 2), np.float32)
+        outcome = Runner(controller, driver).run(3)
+        self.assertIsNone(outcome.reasons[0])
+        self.assertIn("The pose of the object is 1.0", outcome.reasons[1])
+        first, second = np.diff(driver.sent, axis=0)[-20:, :, 0].T
+        assert_allclose(first, 0.01, rtol=1e-4)
+        assert_array_equal(second, 0)
 
     def test_joints_slightly_beyond_their_limits_are_tolerated(self):
         driver = Scripted(after(0, joint_pos=np.array([-1.09, 9.09])))
@@ -366,34 +394,25 @@ class FaultTest(TestCase):
                 return replace(reading, object_pos=np.ones(3), object_time=time - 0.8)
             return replace(reading, object_time=time - 0.2)
 
-        class Noting(Steady):
-            def step(self, reading):
-                highest.append(reading.object_pos[0, 2])
-                return super().step(reading)
-
-        highest = []
         driver = Scripted(fault)
-        outcome = Runner(Noting(), driver).run(3)
-        self.assertLess(max(highest), 0.5)
+        controller = Noting()
+        outcome = Runner(controller, driver).run(3)
+        assert_allclose([reading.object_pos[0, 0] for reading in controller.readings], 0.5)
         self.assertIsNone(outcome.reason)
         self.assertGreater(outcome.refused[0], 10)
         self.assertEqual((len(driver.sent), driver.stops), (149, 1))  # the first pose is faulty
 
     def test_a_sensor_of_forces_that_begins_with_a_fault(self):
         """The first forces are not finite, so there are no sound ones before them."""
-        forces = []
-
-        class Noting(Steady):
-            def step(self, reading):
-                forces.append(reading.tip_force)
-                return super().step(reading)
 
         def fault(time, reading):
             if time < 0.05:
                 return reading
             return replace(reading, tip_force=np.full((2, 3), np.nan if time < 0.1 else 1.0))
 
-        self.assertIsNone(Runner(Noting(), Scripted(fault)).run(1).reason)
+        controller = Noting()
+        self.assertIsNone(Runner(controller, Scripted(fault)).run(1).reason)
+        forces = [reading.tip_force for reading in controller.readings]
         self.assertEqual(forces[:3], [None] * 3)
         assert_array_equal(np.concatenate(forces[3:5]), np.zeros((2, 2, 3)))
         assert_array_equal(forces[-1], np.ones((1, 2, 3)))

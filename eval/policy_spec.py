@@ -13,7 +13,7 @@ from xreset.files.checks import Checked, Seed, frozen, obeys_rules
 from xreset.files.text import Brief, shown
 from xreset.geometry.description import load_robot
 from xreset.learning.exported import PolicyFile, find_policy
-from xreset.live.deploy import check_made_for, deployed_graph, is_deployed, made_for, training_of
+from xreset.live.deploy import check_made_for, deployed_graph, is_deployed, training_of
 from xreset.objects.catalogue import object_names
 from xreset.physics.plugins import robot_of_file
 from xreset.policy.onnx_policy import (
@@ -158,7 +158,7 @@ class PolicySpec(Brief, Checked):
         if is_deployed(content):
             return content
         graph = graph_of(content)
-        if graph is not None and made_for(graph, self.robot):
+        if graph and Controller(graph).contract["robot_fingerprint"] == self.robot.fingerprint:
             return graph
         if self.task.vision.cameras:
             raise PolicyError(

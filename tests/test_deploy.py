@@ -18,7 +18,7 @@ import onnx
 import onnxruntime
 import torch
 import yaml
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 
 from tests import toy_grasp
 from tests.command import refused, succeeds
@@ -41,6 +41,7 @@ from xreset.live import cache
 from xreset.live.deploy import with_objects, write_deployed
 from xreset.live.engine import EngineDriver
 from xreset.live.graph import policy_graph
+from xreset.live.leapp import leapp_description
 from xreset.policy.onnx_policy import OnnxPolicy
 from xreset.runtime import Controller, LiveError, Reading, load_controller
 from xreset.runtime.contract import KEY, parse_contract
@@ -189,6 +190,7 @@ class ToyTest(InFolder):
 
     def test_an_episode_that_does_not_fit_is_refused(self):
         points = np.array(self.contract["objects"]["brick"]["points"])
+        first = self.controller.step(self.begin())
         for name, value, words in (
             ("target", self.home[1:], r"target has shape \(4,\), expected \(5,\)"),
             ("goal_pos", [0.5, 0.3], r"goal_pos has shape \(2,\), expected \(3,\)"),
@@ -202,10 +204,22 @@ class ToyTest(InFolder):
             ("object_points", points[1:], r"points of shape \(63, 3\), expected \(64, 3\)"),
         ):
             reading = self.begin()
-            self.controller.step(reading)
+            target = self.controller.step(reading)
+            assert_array_equal(target, first, "it remembers nothing of an earlier episode")
             with self.subTest(name, value=np.shape(value)):
                 self.assertRaisesRegex(LiveError, words, self.begin, **{name: value})
                 self.assertRaisesRegex(LiveError, "has begun", self.controller.step, reading)
+
+    def test_targets_stay_within_the_limits_of_the_contract(self):
+        contract = json.loads(json.dumps(self.contract))
+        for joint in contract["joints"]:
+            joint |= {"lower": joint["home"] - 1e-3, "upper": joint["home"] + 1e-3}
+        self.controller = Controller(self.with_metadata(json.dumps(contract)))
+        assert_allclose(self.controller.step(self.begin()), [self.home], atol=1.1e-3)
+        target = np.float32(self.home)
+        self.begin(target=target)
+        target += 1  # the array of a robot
+        assert_allclose(self.controller.target, [self.home], atol=1e-6)
 
     def test_a_reading_that_does_not_fit_is_refused(self):
         controller = self.controller
@@ -451,6 +465,11 @@ class ToyTest(InFolder):
         self.assertEqual(
             described["pipeline"]["feedback_flow"], {"policy/memory_out": ["policy/memory_in"]}
         )
+        own = onnx.load_from_string(self.graph)
+        own.graph.node.append(onnx.helper.make_node("Identity", ["target"], ["score"]))
+        score = onnx.helper.make_tensor_value_info("score", onnx.TensorProto.FLOAT, None)
+        own.graph.output.append(score)
+        self.assertNotIn("score", leapp_description(own.SerializeToString()))
         digest = hashlib.sha256((self.out / "policy.onnx").read_bytes()).hexdigest()
         self.assertEqual(node["parameters"]["sha256sum"], digest)
 

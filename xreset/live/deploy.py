@@ -191,11 +191,6 @@ def check_made_for(source: str, contract: Contract, robot: RobotSpec) -> None:
         )
 
 
-def made_for(graph: bytes, robot: RobotSpec) -> bool:
-    """Return whether a deployed policy was made for a robot with this description, in the same place."""
-    return Controller(graph).contract.get("robot_fingerprint") == robot.fingerprint
-
-
 def with_objects(graph: bytes, objects: Sequence[ObjectSpec]) -> bytes:
     """Return a deployed policy whose contract lists other objects. It needs no torch."""
     controller = Controller(graph)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from . import LiveError, Reading, load_controller
+from . import LiveError, load_controller
 
 _STEPS = 1000
 
@@ -21,23 +21,11 @@ def main() -> None:
     except LiveError as error:
         sys.exit(f"runtime: {error}")
     contract = controller.contract
-    home = np.array([joint["home"] for joint in contract["joints"]])
-    pos = np.array([0.5, 0.0, 0.1])
-    quat = np.array([1.0, 0.0, 0.0, 0.0])
-    points = np.zeros(controller.shapes.get("object_points", (1, 3)))
-    controller.begin(points, pos, quat, home, np.zeros(3))
-    reading = Reading(
-        joint_pos=home,
-        joint_vel=0.0 * home,
-        joint_time=0.0,
-        object_pos=pos,
-        object_quat=quat,
-        object_time=0.0,
-    )
+    reading = controller.begin_at_home().batched()
     milliseconds = []
     for _ in range(_STEPS):
         began = time.perf_counter()
-        controller.step(reading.batched())
+        controller.step(reading)
         milliseconds.append(1000.0 * (time.perf_counter() - began))
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     print(

@@ -316,21 +316,26 @@ class Controller:
         outputs = [np.asarray(value) for value in self._session.run(None, feed)]
         return dict(zip(self.outputs, outputs, strict=True))
 
-    def _try_step(self) -> None:
-        """Take a step from home, so that a policy that cannot act is refused before a robot moves."""
+    def begin_at_home(self) -> Reading:
+        """Begin an episode to try the policy, and return the reading of a robot that stays at home."""
         joints = joint_values(self.contract, "home", 0.0)
-        origin = np.zeros(3, np.float32)
-        upright = np.array([1, 0, 0, 0], np.float32)
-        points = np.zeros(self.shapes.get("object_points", (1, 3)), np.float32)
+        origin = np.zeros(3)
+        upright = np.array([1.0, 0.0, 0.0, 0.0])
+        points = np.zeros(self.shapes.get("object_points", (1, 3)))
         self.begin(points, origin, upright, joints, origin)
-        reading = Reading(
+        return Reading(
             joint_pos=joints,
-            joint_vel=np.zeros_like(joints),
+            joint_vel=0.0 * joints,
             joint_time=0.0,
             object_pos=origin,
             object_quat=upright,
             object_time=0.0,
         )
+
+    def _try_step(self) -> None:
+        """Take two steps from home, so that a policy that cannot act is refused before a robot moves."""
+        joints = self.contract["joints"]
+        reading = self.begin_at_home()
         target = self.step(reading)
         if target.shape != (1, len(joints)) or not np.isfinite(target).all():
             raise ValueError(f"the targets at home are {target}")

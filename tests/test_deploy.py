@@ -556,7 +556,7 @@ class RefusedTest(TestCase):
         for network in (b"hello", "mine.onnx"):
             words = f"network is {network!r}, expected the content of an ONNX file"
             with refuses(self, words, PolicyError):
-                deployed_graph(network, robot, TaskConfig())
+                policy_graph(network, robot, TaskConfig())
         network = torch.nn.Linear(1, 1)
         for name in ("object_linvel", "reward", "least_tip_distance"):
             draft = ObservationConfig()

@@ -7,6 +7,7 @@ import tarfile
 import tempfile
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from unittest import SkipTest, TestCase, mock
 
 import mujoco
@@ -29,7 +30,7 @@ from xreset.robot_tools import check as checks
 from xreset.robot_tools import homes
 from xreset.robot_tools.check import check
 from xreset.robot_tools.draft import hand_side
-from xreset.robot_tools.fingers import Hand, _stated_finger
+from xreset.robot_tools.fingers import Hand, _first_of_five
 from xreset.robot_tools.importer import make_robot
 from xreset.robot_tools.sources import _at, bare, completed, grounded, read_source, renamed
 from xreset.spec import SceneSpec, TableSpec
@@ -132,6 +133,12 @@ class Toy(Robots):
         path = self.file(file, text)
         return completed(read_source(path, notes), path, notes), " ".join(notes)
 
+    def fingers(self, file, text):
+        """Name of each finger -> its last link, and what is guessed."""
+        notes = []
+        hand = Hand(self.read(file, text)[0], self.folder, None, notes)
+        return {tip.name: tip.contact_links[0] for tip in hand.tips}, notes
+
     def test_a_folder_that_passes_the_check_and_says_what_it_guessed(self):
         spec = self.spec
         self.assertEqual(spec.name, "mine", "the name of its folder")
@@ -167,18 +174,11 @@ class Toy(Robots):
             }
             with self.subTest(y=y), mock.patch.dict(_PLACES, places):
                 hand = _hand(*map(_finger, ("f1", "f2", "thumb"))).replace("thumb", thumb)
-                made = make_robot(
-                    self.arm, self.file("hand.urdf", hand), self.folder / f"mine{1e3 * y:g}"
-                )
-                tips = {
-                    tip.name: tip.contact_links[0] for tip in load_robot(made.folder).fingertips
-                }
+                tips, notes = self.fingers("hand.urdf", hand)
                 links = {"thumb": f"{thumb}_b", "index": "f1_b", "middle": "f2_b"}
                 self.assertEqual(tips, links)
-                self.assertIn(
-                    "fingers are named as in a right hand: index is f1_b; middle is f2_b",
-                    made.guessed,
-                )
+                said = "fingers are named as in a right hand: index is f1_b; middle is f2_b"
+                self.assertIn(said, notes)
 
     def test_the_palm_faces_where_the_fingers_bend(self):
         hand, palm = at_home(self.spec, "hand_base", "palm_frame")
@@ -222,26 +222,25 @@ class Toy(Robots):
         home = tensor(held.home)[None]
         self.assertGreater(table_clearance(Kinematics(robot), home, TableSpec()), 0.4)
 
-    def test_names_of_the_shadow_hand(self):
-        shadow = HAND
-        for old, code in (("f1", "LF"), ("f2", "MF"), ("f3", "TH"), ("thumb", "FF")):
-            for end, new in (("a", "proximal"), ("b", "middle"), ("", "J")):
-                shadow = shadow.replace(f"{old}_{end}", f"rh_{code}{new}")
-        spec = load_robot(self.imported(shadow))
-        links = [f"{tip.name} {tip.contact_links[0]}" for tip in spec.fingertips]
-        expected = "thumb rh_THmiddle index rh_FFmiddle middle rh_MFmiddle little rh_LFmiddle"
-        self.assertEqual(" ".join(links), expected)
-
-    def test_what_names_say_of_a_finger(self):
-        for names, finger in (
-            ("RThumb1_link", "thumb"),
-            ("l_lindex_tip", "index"),
-            ("LEFT_RING_2", "ring"),
-            ("spring_1 bearing", ""),
-            ("rh_LFJ4", "little"),
-            ("rf_mount", ""),
+    def test_fingers_are_what_their_names_say(self):
+        for codes, ends in (
+            (("rh_LF", "rh_MF", "rh_TH", "rh_FF"), ("proximal", "middle")),  # as Shadow's
+            (("l_lpinky", "LMiddle", "LThumb", "LEFT_INDEX"), ("_a", "_b")),
         ):
-            self.assertEqual(_stated_finger(names), finger, names)
+            hand = HAND
+            for old, code in zip(_PLACES, codes, strict=True):
+                for end, new in zip(("_a", "_b", "_"), (*ends, "J"), strict=True):
+                    hand = hand.replace(f"{old}{end}", f"{code}{new}")
+            last = [f"{code}{ends[1]}" for code in codes]
+            expected = dict(zip(("little", "middle", "thumb", "index"), last, strict=True))
+            self.assertEqual(self.fingers("hand.urdf", hand)[0], expected)
+
+    def test_the_first_of_five_numbered_fingers_has_a_point(self):
+        for numbers, points in ((range(5), 1.0), (range(1, 6), 1.0), (range(4), 0.0)):
+            fingers = [SimpleNamespace(links=("x", f"f{number}_3")) for number in numbers]
+            self.assertEqual(
+                _first_of_five(fingers).tolist(), [points, *[0.0] * (len(fingers) - 1)]
+            )
 
     def test_a_coupled_joint_has_the_limits_that_its_source_gives_it(self):
         folder = self.imported(
@@ -475,8 +474,8 @@ class Toy(Robots):
 
     def test_the_fingers_of_a_jaw_are_thumb_and_index_whatever_their_names(self):
         text = JAW.replace('"l_pad"', '"lf_tip"').replace('"r_pad"', '"rf_tip"')
-        hand = Hand(self.read("jaw.xml", text)[0], self.folder, None, [])
-        self.assertEqual([tip.name for tip in hand.tips], ["thumb", "index"])
+        tips = {"thumb": "lf_tip", "index": "rf_tip"}
+        self.assertEqual(self.fingers("jaw.xml", text)[0], tips)
 
     def test_damaged_or_huge_mjcf_is_refused(self):
         world = "<worldbody>"

@@ -109,14 +109,10 @@ class View:
         return np.flatnonzero(keep)
 
     def some_rows(self, sequence: int | None, frame: int | None = None) -> np.ndarray:
-        """Return the indices of the rows of a sequence, in order; at least one.
-
-        Args:
-            sequence: None: all sequences; of a motion, the first one.
-            frame: a place among the rows that must exist.
+        """Return the indices of the rows of a sequence, in order; None: of all, or of the first one of a motion.
 
         Raises:
-            XResetError: unknown sequence or frame, or the sequence has no row.
+            XResetError: there is no such sequence or frame, or no row.
         """
         if sequence is None and self.is_motion:
             sequence = 0

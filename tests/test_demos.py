@@ -147,6 +147,7 @@ class Archive(InFolder):
             ({"objects": ["banana"]}, [2, 3]),
             ({"objects": "banana", "side": "right"}, [2, 3]),
             ({"per_object": 1}, [0, 2]),
+            ({"share": 0.1}, [0, 2]),
             ({"indices": [3, 0]}, [3, 0]),
             ({"sequences": names[1:2], "side": "right", "subjects": ["synthetic"]}, [1]),
         ):
@@ -226,10 +227,8 @@ class Archive(InFolder):
     def test_an_object_and_its_mesh_have_one_name(self):
         for mesh in ("025_mug", "soup"):  # an official name stays, whatever the mesh is called
             trimesh.creation.box((0.05, 0.06, 0.07)).export(self.folder / f"{mesh}.obj")
-        self.assertEqual(
-            [*demo_objects(self.demos.select(indices=[0]), self.folder)],
-            ["005_tomato_soup_can"],
-        )
+        (soup,) = demo_objects(self.demos.select(indices=[0]), self.folder).values()
+        self.assertEqual(soup.name, "005_tomato_soup_can")
         words = "name an object 'mug', which is '025_mug' here. Rename its mesh, or"
         with self.assertRaisesRegex(DemoError, words):
             demo_objects(self.changed(0, object_name="mug").select(indices=[0]), self.folder)

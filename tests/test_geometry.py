@@ -93,11 +93,12 @@ class SurfaceTest(TestCase):
 
     def test_contacts_need_annotation_and_nearness(self):
         quat = np.array([[np.sqrt(0.5), 0, 0, np.sqrt(0.5)]])  # x of the object is y of the world
-        keypoints = np.array([[[1.0, 2.045, 3.0], [1.0, 2.060, 3.0], [np.nan] * 3]])
+        at = [(1.0, y, 3.0) for y in (2.045, 1.955, 2.060)]
+        keypoints = np.array([[*at, [np.nan] * 3]])
         points, contact = self.surface.contacts(keypoints, np.array([[1.0, 2.0, 3.0]]), quat, 0.02)
-        self.assertEqual(contact.tolist(), [[True, False, False]])
-        assert_allclose(points[0, 0], [1.0, 2.03, 3.0], atol=1e-9)
-        assert_array_equal(points[0, 1:], 0.0)
+        self.assertEqual(contact.tolist(), [[True, True, False, False]])
+        assert_allclose(points[0, :2], [[1.0, 2.03, 3.0], [1.0, 1.97, 3.0]], atol=1e-9)
+        assert_array_equal(points[0, 2:], 0.0)
 
 
 class ShapesTest(TestCase):

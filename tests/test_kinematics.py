@@ -141,13 +141,19 @@ class UrdfTest(InFolder):
         self.assertEqual((joint.type, joint.lower, joint.upper), ("revolute", -np.inf, np.inf))
         assert_array_equal(joint.axis, (1, 0, 0))
         self.assertEqual(tree.link("end").mass, 0)
+        moments = '<inertia ixx="1" ixy="0" ixz="0" iyy="2" iyz="0" izz="3"/>'
+        inertial = f'<inertial>{origin}<mass value="1"/>{moments}</inertial>'
+        end = load_urdf(self.urdf(f'<link name="end">{inertial}</link>', joint)).link("end")
+        assert_allclose(end.inertia, np.diag((2, 1, 3)), atol=1e-12)
+        assert_array_equal(end.com, (1, 2, 3))
 
     def test_a_limit_of_zero_is_none(self):
         """SolidWorks and other programs write it where nothing was stated."""
         limit = '<limit lower="0" upper="1" effort="0" velocity="0"/></joint>'
         joint = FIXED.format(name="j", child="end").replace("fixed", "revolute")
         tree = load_urdf(self.urdf('<link name="end"/>', joint.replace("</joint>", limit)))
-        self.assertEqual((tree.joint("j").effort, tree.joint("j").velocity), (0.0, np.inf))
+        found = tree.joint("j")
+        self.assertEqual((found.effort, found.velocity, found.lower), (0.0, np.inf, 0.0))
 
     def test_what_is_written_reads_back(self):
         """Also links whose names differ in a slash only, and a comment with two hyphens."""

@@ -62,8 +62,8 @@ class MirrorTest(InOneFolder):
         assert_allclose(right, left * [-1.0, 1.0, 1.0], atol=1e-5)
 
     def test_an_object_that_is_not_symmetric_is_refused(self):
-        crooked = dataclasses.replace(self.symmetries[self.object.name], deviation=0.02)
-        with self.assertRaisesRegex(DemoError, r"mustard_bottle 20\.0 mm"):
+        crooked = dataclasses.replace(self.symmetries[self.object.name], deviation=0.0045)
+        with self.assertRaisesRegex(DemoError, r"mustard_bottle 4\.5 mm"):
             mirrored(self.demos, {self.object.name: crooked})
 
     def test_the_command_mirrors_the_left_hands_of_an_archive(self):

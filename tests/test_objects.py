@@ -274,11 +274,12 @@ class MeshImport(InFolder):
         file.write_bytes(file.read_bytes()[:100])  # a damaged cache is made again
         with patch("xreset.objects.cache.decompose", return_value=decompose(BOX)) as cut:
             self.load(RING)
-        self.assertEqual(cut.call_count, 1)
+            self.load(RING, facts="tolerance = 0.003")  # other settings, other pieces
+        self.assertEqual(cut.call_count, 2)
         with patch("xreset.objects.cache.distributions", return_value=[Mock(version="99")]):
             self.load(BOX)
         self.load(BOX)  # the cache knows the version of the cutter
-        self.assertEqual(len(list(file.parent.glob("*.npz"))), 3)
+        self.assertEqual(len(list(file.parent.glob("*.npz"))), 4)
 
     def test_pieces_whose_cutting_was_stopped_are_cached_and_still_say_so(self):
         stopped = replace(decompose(BOX), finished=False)
@@ -628,6 +629,9 @@ class ThinWalls(InFolder):
         self.assertFalse(sheet.is_volume)
         solid = as_solid(sheet)
         self.assertAlmostEqual(solid.volume(), sheet.area * 0.001, delta=0.1 * sheet.area * 0.001)
+        pail = CUBE.copy()
+        pail.update_faces(pail.face_normals[:, 2] < 0.5)
+        self.assertLess(as_solid(pail).volume(), 1e-4)
         pieces = decompose(sheet, Settings(hull_depth=0.0, tolerance=0.004))
         # 20 mm above the bottom
         self.assertGreater(distance_to_pieces([0, 0, 0.02], pieces.shapes), 0.012)

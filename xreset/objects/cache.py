@@ -27,12 +27,12 @@ _NUMBERS = {
     "volume": Field((), "f"),
     "com": Field((3,), "f", within=POSITION),
     "inertia": Field((3, 3), "f"),
+    "finished": Field((), "b"),
 }
 SCHEMA = {
     "vertices": Field(("V", 3), "f", within=POSITION),
     "offsets": Field(("K+1",), "i"),
     **_NUMBERS,
-    "finished": Field((), "b", required=False),
 }
 _ALGORITHM = 4
 """Raise it when :mod:`xreset.objects.decompose` gives other pieces or mass properties than before."""
@@ -59,7 +59,7 @@ def cached_pieces(mesh: trimesh.Trimesh, source: str, settings: Settings) -> Pie
     pieces = decompose(mesh, settings)
     parts = [np.asarray(piece.geometry.vertices) for piece in pieces.shapes]
     arrays = {"vertices": np.concatenate(parts), "offsets": np.cumsum([0, *map(len, parts)])}
-    arrays |= {name: np.asarray(getattr(pieces, name)) for name in (*_NUMBERS, "finished")}
+    arrays |= {name: np.asarray(getattr(pieces, name)) for name in _NUMBERS}
     with suppress(XResetError, OSError):
         write_npz(path, SCHEMA_NAME, arrays, inputs={"mesh": source})
     return pieces
@@ -69,8 +69,7 @@ def _read_pieces(path: Path) -> Pieces:
     arrays = read_npz(path, SCHEMA_NAME, SCHEMA, what="cached convex pieces")
     shapes = tuple(hull(part) for part in np.split(arrays["vertices"], arrays["offsets"][1:-1]))
     numbers: dict[str, Any] = {name: arrays[name][()] for name in _NUMBERS}
-    finished = bool(arrays.get("finished", True))  # 0.2 kept no others
-    return Pieces(shapes=shapes, finished=finished, **numbers)
+    return Pieces(shapes=shapes, **numbers)
 
 
 def cache_folder() -> Path | None:

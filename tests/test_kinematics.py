@@ -137,9 +137,9 @@ class UrdfTest(InFolder):
             self.assertEqual((shape.geometry.kind, shape.geometry.size), expected)
         turned = [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]]
         assert_allclose(found[0].T_body_shape, turned, atol=1e-12)
-        joint = tree.joint("j")
-        self.assertEqual((joint.type, joint.lower, joint.upper), ("revolute", -np.inf, np.inf))
-        assert_array_equal(joint.axis, (1, 0, 0))
+        found = tree.joint("j")
+        self.assertEqual((found.type, found.lower, found.upper), ("revolute", -np.inf, np.inf))
+        assert_array_equal(found.axis, (1, 0, 0))
         self.assertEqual(tree.link("end").mass, 0)
         moments = '<inertia ixx="1" ixy="0" ixz="0" iyy="2" iyz="0" izz="3"/>'
         inertial = f'<inertial>{origin}<mass value="1"/>{moments}</inertial>'

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
-from tests.command import succeeds, xreset
+from tests.command import refused, succeeds, xreset
 from tests.data import InFolder, data_dir, refuses
 from tests.test_demos import angles, assert_same_motion
 from tests.wrong_recordings import CAMERA
@@ -240,6 +240,7 @@ class Synthetic(InFolder):
             ("more than 21 keypoints, such as x21.*OpenXR", first.replace("confidence", "x21")),
             ("same name", first.replace("z20", "z19")),
             ("first line has numbers", first.partition("\n")[2]),
+            ("rows of a sequence must follow", re.sub(r"(?m)^a(.*\n)a", r"a\1b", first)),
             ("column side changes", first.replace(",right,", ",left,", 1)),
         ):
             path.write_text(text)
@@ -277,6 +278,9 @@ class Synthetic(InFolder):
             self.assertIn(option, said)
         self.assertFalse(out.exists())
         words = "--order mediapipe --units mm --coordinates camera --fps 10 --side right --object 005_tomato_soup_can"
+        np.savetxt(self.folder / "mm.txt", np.eye(4) + 500 * np.eye(4, k=3))
+        said = refused(*command, words, "--table-from-camera", self.folder / "mm.txt")
+        self.assertIn("Are these millimetres?", said)
         self.assertIn(
             "2 sequences",
             succeeds(*command, words, "--table-from-camera", f"{self.folder}/T.txt"),

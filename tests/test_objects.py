@@ -174,6 +174,13 @@ class Sampling(TestCase):
         points = surface_points(obj, 64)
         self.assertGreater(cKDTree(points).query(points, k=2)[0][:, 1].min(), 0.008)
 
+    def test_most_of_a_surface_may_be_inside(self):
+        """Before, there were fewer points than were wanted, as with a machine and its parts."""
+        boxes = [trimesh.creation.box((0.1 - 0.001 * k,) * 3) for k in range(60)]
+        mesh = trimesh.util.concatenate(boxes)
+        obj = replace(load_object("soup"), vertices=mesh.vertices, faces=mesh.faces)
+        assert_allclose(np.abs(surface_points(obj)).max(axis=1), 0.05, atol=1e-9)
+
     def test_keypoints_are_corners_that_span_the_box(self):
         obj = load_object("scissors")
         points = keypoints(obj)

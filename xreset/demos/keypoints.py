@@ -47,6 +47,8 @@ _GAP = 0.3
 """Longest time between two frames over which the hand and a moving object are interpolated [s]."""
 _GAP_MOTION = 0.02
 """An object that moves farther in such a time moves [m]."""
+_FARTHEST_CAMERA = 20.0
+"""Distance of a camera from the table, above which its pose is in another unit [m]."""
 _USUAL_RATES = (24 / 1.001, 30 / 1.001, 60 / 1.001, 120 / 1.001)
 """Rates of video that are no whole numbers [1/s]."""
 
@@ -164,6 +166,10 @@ def read_transform(path: str | Path) -> np.ndarray:
         raise DemoError(
             f"{path} holds {T.shape} numbers {shown(T.tolist())}, expected the 4x4 matrix of a rotation and a"
             " translation, with the last row 0 0 0 1."
+        )
+    if np.linalg.norm(T[:3, 3]) > _FARTHEST_CAMERA:
+        raise DemoError(
+            f"{path} has the translation {T[:3, 3].tolist()}. Are these millimetres? It must be in metres."
         )
     return T
 
@@ -353,7 +359,8 @@ def _evenly(arrays: Arrays, convention: Convention, motion: Motion) -> tuple[flo
     """Return the rate, and the motion at that rate: as it is, or interpolated between its own times."""
     if len(motion[1]) < 2:
         raise DemoError(
-            "it has one frame. A demonstration has the start and the goal of the object."
+            "it has one frame. A demonstration has the start and the goal of the object. In a CSV, the rows of a"
+            " sequence must follow one another."
         )
     if "time" not in arrays:
         rate = float(arrays["fps"]) if "fps" in arrays else convention.fps

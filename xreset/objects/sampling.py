@@ -8,6 +8,7 @@ from typing import Literal
 
 import numpy as np
 
+from xreset.errors import ObjectError
 from xreset.geometry.shapes import turn_of, winding_number
 from xreset.spec import ObjectSpec
 
@@ -17,6 +18,8 @@ METRIC_POINTS = 64
 """Points of the published success (the published paper, section V)."""
 _CANDIDATES_PER_POINT = 8
 """Samples of the surface that each wanted point is chosen from."""
+_MOST_CANDIDATES = 100_000
+"""Samples from which points are no longer looked for."""
 _PROBE = 2e-4
 """Distance from the surface at which a sample is tested [m]: above rounding, below any feature."""
 
@@ -39,11 +42,14 @@ _SURFACE_POINTS: dict[tuple[bytes, int], np.ndarray] = {}
 
 
 def _spread_points(obj: ObjectSpec, count: int) -> np.ndarray:
-    points, _, normals = sample_surface(
-        obj.vertices, obj.faces, max(_CANDIDATES_PER_POINT * count, 256)
-    )
-    outside = winding_number(points + _PROBE * normals, obj.vertices, obj.faces) < 0.5
-    return farthest_points(points[outside], count)
+    candidates = max(_CANDIDATES_PER_POINT * count, 256)
+    outside = np.empty((0, 3))
+    while len(outside) < count and candidates < _MOST_CANDIDATES:
+        points, _, normals = sample_surface(obj.vertices, obj.faces, candidates)
+        number = winding_number(points + _PROBE * normals, obj.vertices, obj.faces)
+        outside = points[number < 0.5]
+        candidates *= 8  # much of the surface may be inside
+    return farthest_points(outside, count)
 
 
 def metric_points(obj: ObjectSpec, frame: Frame = "mesh") -> np.ndarray:
@@ -76,7 +82,9 @@ def farthest_points(points: np.ndarray, count: int) -> np.ndarray:
     """[count, 3] points chosen one after another, each the farthest from those chosen before; the first is the farthest
     from the mean."""
     if len(points) < count:
-        raise ValueError(f"{count} points wanted of {len(points)}")
+        raise ObjectError(
+            f"Only {len(points)} of {count} points are on the outside of the mesh. Repair it, for example in MeshLab."
+        )
     chosen = [np.argmax(np.linalg.norm(points - points.mean(axis=0), axis=1))]
     distance = np.full(len(points), np.inf)
     while len(chosen) < count:

@@ -535,7 +535,7 @@ def _of_motion(r: Recording) -> Iterator[Finding]:
             "The object moves but does not turn at all.",
             "Its orientations may be missing, or those of the first frame.",
         )
-    if (r.moved & r.seen).sum() == 0 and r.moved.any():
+    if r.moved.any() and not (r.moved & r.seen).any():
         yield _doubt(
             "unseen",
             "The hand is not seen in any frame in which the object has moved.",

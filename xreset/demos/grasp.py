@@ -35,6 +35,7 @@ _STACK = np.array([0.0, -0.004, -0.026, -0.043, -0.059])
 _FINGER_ROOM = 0.022  # free space that a finger needs next to the object [m]
 _LEANS = (0.6, 1.0)  # first guesses: lean of the back of the hand to the fingers' side [rad]
 _POSTURE = hand.RELAXED + np.array([0.0, 0.25, 0.25] * 4 + [0.0] * 5)  # of a grasping hand
+_AZIMUTHS = np.radians(np.arange(0.0, 360.0, 20.0))  # from the fingers' side to the thumb's [rad]
 _GRID = 0.012  # spacing of the centers that are tried [m]
 # steepness of a hand that comes from the side [rad]: the first is the most natural
 _SIDE_TILTS = (0.6, 0.4, 0.15)
@@ -157,17 +158,13 @@ class Grasp:
     """Deepest keypoint or bone inside object or table [m]."""
 
 
-def plan_contacts(solid: Solid, azimuths: np.ndarray, side: str) -> list[Contacts]:
-    """Return all contacts that a hand could use, best first.
-
-    Args:
-        azimuths: [A] directions to try from the fingers' side to the thumb's, as angles about z [rad].
-    """
+def plan_contacts(solid: Solid, side: str) -> list[Contacts]:
+    """Return all contacts that a hand could use, best first."""
     low = solid.vertices.min(axis=0)
     high = solid.vertices.max(axis=0)
     from_above = high[2] <= _LOW_OBJECT
     found = []
-    for azimuth in azimuths:
+    for azimuth in _AZIMUTHS:
         closing = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
         # horizontal, away from the hand
         away = np.array([closing[1], -closing[0], 0.0]) * handedness(side)

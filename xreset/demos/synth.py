@@ -220,7 +220,7 @@ class _Starts:
         quat = resting_orientation(self._obj, up)
         height = rest_height(self._obj, quat)
         solid = Solid.of(self._obj, np.array([0.0, 0.0, height]), turn_of(quat))
-        plans = plan_contacts(solid, np.radians(np.arange(0.0, 360.0, 20.0)), self._side)
+        plans = plan_contacts(solid, self._side)
         return solid, [plan for plan in plans if plan.cost < plans[0].cost + _NEAR_BEST]
 
 

@@ -148,16 +148,11 @@ class Geometry(TestCase):
         points = np.array([[-0.5, 0.1, 0.2], [0.5, 0.1, 0.2], [2.5, 0.1, 0.2]])
         assert_allclose(winding_number(points, both.vertices, both.faces), [1, 2, 0], atol=1e-9)
 
-    def test_limited_hull_adds_the_farthest_of_all_vertices(self):
-        points = ellipsoid()
-        limited = limited_hull(points).geometry.vertices
-        chosen = np.flatnonzero((points[:, None] == limited).all(axis=-1).any(axis=1))
-        along = points @ np.vstack((np.eye(3), [(1, 1, 1), (1, 1, -1), (1, -1, 1), (-1, 1, 1)])).T
-        expected = {*along.argmin(axis=0).tolist(), *along.argmax(axis=0).tolist()}
-        while len(expected) < 64:
-            planes = ConvexHull(points[sorted(expected)]).equations
-            expected.add(int(plane_heights(points, planes).max(axis=1).argmax()))
-        self.assertEqual(chosen.tolist(), sorted(expected))
+    def test_limited_hull_has_the_vertices_that_matter_most(self):
+        limited = limited_hull(ellipsoid())
+        self.assertEqual(len(limited.geometry.vertices), 64)
+        outside = plane_heights(ellipsoid(), half_spaces(limited)).max()
+        self.assertLess(outside, 0.0011)  # 2.7 mm or more with 64 random ones
 
 
 class Sampling(TestCase):

@@ -279,7 +279,7 @@ class UsageTest(TestCase):
         self.assertLessEqual(len(words.splitlines()), 80)
         for text in (words, reset):
             self.assertLessEqual(max(map(len, text.splitlines())), 80)
-        self.assertNotIn("{None}", words)
+        self.assertNotIn("{None}", words + run("robots import --help")[1])
         self.assertNotIn("--config.task", words)
         for name in ("task.randomization.push", "ppo", "model"):
             self.assertIn(f" {name} ", parts)

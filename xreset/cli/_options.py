@@ -235,7 +235,8 @@ def _optional(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
     if info.type_origin not in (Union, UnionType) or len(parts) != 2 or parts[1] is not NoneType:
         return None
     spec = ConstructorRegistry.get_primitive_spec(PrimitiveTypeInfo.make(parts[0], info.markers))
-    if not isinstance(spec, PrimitiveConstructorSpec) or spec.nargs != 1:
+    # a range, of two numbers, that a recipe states may be set to None
+    if not isinstance(spec, PrimitiveConstructorSpec) or spec.nargs not in (1, 3):
         return None
     return replace(
         spec,

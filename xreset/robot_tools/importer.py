@@ -203,6 +203,11 @@ def _read_arm(path: Path, flange: str | None, notes: list[str]) -> _Arm:
     if path.is_dir() or str(path) in robot_names():
         robot = load_robot(path)
         path = robot.urdf
+    elif not path.is_file():
+        raise RobotError(
+            f"'{path}' is not a file. Expected an arm's URDF or MJCF there, or the name of a robot: "
+            f"{', '.join(robot_names())}."
+        )
     tree = completed(read_source(path, notes), path, notes)
     if flange is None:
         flange = last_link(tree, None if robot is None else robot.hand_root)

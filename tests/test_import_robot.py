@@ -543,7 +543,11 @@ class Toy(Robots):
             f'<joint name="b{i}" type="slide" axis="{axis}"/>' for i, axis in enumerate(_AXES)
         ]
         text = MJCF.replace('name="base">', f'name="base">{"".join(slides)}')
-        text = text.replace("</worldbody>", f"{_PEN}</worldbody>")
+        mocap = '<body name="user" mocap="true"/></worldbody>'
+        text = text.replace("</worldbody>", f"{_PEN}{mocap}")
+        text = text.replace(
+            "</equality>", '<weld name="hold" body1="user" body2="base"/></equality>'
+        )
         exclude = '<contact><exclude body1="f1_a" body2="f2_a"/></contact></mujoco>'
         made = make_robot(
             self.arm,
@@ -553,6 +557,7 @@ class Toy(Robots):
         said = " ".join(made.guessed)
         self.assertIn("left out: joints that only let the hand float: b0, b1, b2", said)
         self.assertEqual(said.count("b0"), 1, "it gets neither limits nor a speed")
+        self.assertIn("left out: equalities with a mocap body: hold", said)
         self.assertIn("never collide, because the MJCF says so: f1_a with f2_a", said)
         self.assertIn("left out: what moves next to the hand: pen", said)
         spec = load_robot(made.folder)

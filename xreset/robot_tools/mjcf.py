@@ -82,6 +82,7 @@ def read_mjcf(path: Path, notes: list[str]) -> RobotTree:
     problems = _unsupported(model, solid)
     pulls = _pulls(model, problems, notes)
     _refuse(path, problems)
+    _let_go(model, notes)
     couplings = Couplings(model, [*pulls.values()])
     _refuse(path, couplings.problems)
     notes += couplings.notes
@@ -225,6 +226,17 @@ def _pulls(model: mujoco.MjModel, problems: list[str], notes: list[str]) -> dict
                 f"left out: the actuator {model.actuator(actuator).name!r}, which drives no hinge and no slide"
             )
     return pulls
+
+
+def _let_go(model: mujoco.MjModel, notes: list[str]) -> None:
+    """Switch off the equalities by which a user's mocap body holds a robot, and note them."""
+    is_body = model.eq_objtype == int(mujoco.mjtObj.mjOBJ_BODY)
+    ends = np.where(is_body, (model.eq_obj1id, model.eq_obj2id), 0)
+    held = (model.body_mocapid[ends] >= 0).any(axis=0)
+    model.eq_active0[held] = 0
+    if held.any():
+        names = [model.equality(i).name or f"{i}" for i in np.flatnonzero(held).tolist()]
+        notes.append(f"left out: equalities with a mocap body: {listed(names)}")
 
 
 def _left_out(model: mujoco.MjModel, notes: list[str]) -> None:

@@ -24,7 +24,7 @@ from xreset import load_object, load_robot, make_backend
 from xreset.errors import BackendUnavailableError, RobotError, XResetError
 from xreset.geometry.collision import table_clearance
 from xreset.geometry.kinematics import Kinematics
-from xreset.geometry.shapes import surface_of, transform
+from xreset.geometry.shapes import surface_of, transform, transformed
 from xreset.geometry.urdf import load_urdf
 from xreset.robot_tools import check as checks
 from xreset.robot_tools import homes
@@ -337,20 +337,25 @@ class Toy(Robots):
             assert_allclose(a.T_parent_joint, b.T_parent_joint, atol=1e-9)
 
     def test_links_of_an_mjcf_move_as_in_mujoco(self):
-        """Joints next to their bodies' origins, two of one body, one that is not at 0 in the file, one that is held."""
-        text = """<mujoco><compiler angle="radian"/><worldbody>
+        """Joints next to their bodies' origins, two of one body, one that is not at 0 in the file, one that is held; and a
+        mirrored mesh."""
+        trimesh.creation.box((0.04, 0.02, 0.06)).apply_translation((0.01, 0.02, 0.03)).export(
+            self.folder / "b.stl"
+        )
+        text = """<mujoco><compiler angle="radian"/><asset><mesh file="b.stl" scale="1 -1 1"/></asset><worldbody>
           <body name="base" pos="0.1 0.2 0.3" euler="0.4 0 0"><geom size="0.05"/>
           <body name="a" pos="0 0.1 0.05" euler="0.3 0.5 0"><geom size="0.02"/>
             <inertial pos="0.02 0 0.01" mass="0.1" diaginertia="1e-5 2e-5 2.5e-5" euler="0.2 0.1 0.7"/>
             <joint name="turn" axis="0 1 1" pos="0.01 0.02 0" ref="0.3" range="-1 1"/>
             <joint name="slide" type="slide" axis="1 0 2" range="-0.1 0.1"/>
-          <body name="b" pos="0.05 0 0" euler="0 0.2 0"><geom type="box" size="0.02 0.01 0.03" pos="0.01 0 0"/>
+          <body name="b" pos="0.05 0 0" euler="0 0.2 0"><geom name="b" type="mesh" mesh="b" pos="0.01 0 0"/>
             <joint name="held" axis="1 0 0" range="-1 1"/>
           <body name="c" pos="0.04 0 0"><geom type="capsule" size="0.01 0.02" euler="0.3 0 0" pos="0 0 0.02"/>
             <joint name="end" axis="0 0 1" range="-1 1"/></body></body></body></body></worldbody>
           <equality><joint joint1="held" polycoef="0.4 0 0 0 0"/></equality></mujoco>"""
-        tree = read_source(self.file("chain.xml", text), [])
-        model = mujoco.MjModel.from_xml_string(text)
+        path = self.file("chain.xml", text)
+        tree = read_source(path, [])
+        model = mujoco.MjModel.from_xml_path(str(path))
         data = mujoco.MjData(model)
         positions = {"turn": 0.7, "slide": 0.05, "held": 0.4, "end": -0.6}
         for name, position in positions.items():
@@ -369,19 +374,10 @@ class Toy(Robots):
                 inertial = body.ximat.reshape(3, 3)
                 inertia = inertial @ moments @ inertial.T
                 assert_allclose(R @ link.inertia @ R.T, inertia, atol=1e-12)
-
-    def test_a_mirrored_mesh_of_an_mjcf_is_where_mujoco_has_it(self):
-        palm = trimesh.creation.box((0.08, 0.06, 0.02))
-        palm.apply_translation((0.01, 0.02, 0.03))
-        palm.export(self.folder / "palm.stl")
-        asset = '<asset><mesh name="palm" file="palm.stl" scale="1 -1 1"/></asset><worldbody>'
-        text = MJCF.replace("<worldbody>", asset).replace(
-            'type="box" pos="0.04 0 0" size="0.04 0.04 0.01"',
-            'type="mesh" mesh="palm" pos="0.04 0 0"',
-        )
-        vertices, _ = surface_of(self.read("hand.xml", text)[0].link("base").collisions)
-        assert_allclose(vertices.min(axis=0), (0.01, -0.05, 0.02), atol=1e-6)
-        assert_allclose(vertices.max(axis=0), (0.09, 0.01, 0.04), atol=1e-6)
+        corners = transformed(surface_of(tree.link("b").collisions)[0], poses["b"])
+        mesh = data.geom("b")
+        theirs = mesh.xpos + model.mesh_vert @ mesh.xmat.reshape(3, 3).T
+        assert_allclose(np.sort(corners, axis=0), np.sort(theirs, axis=0), atol=1e-7)
 
     def test_what_mjcf_has_and_robots_do_not_is_named_one_by_one(self):
         ball = MJCF

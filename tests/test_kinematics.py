@@ -161,16 +161,17 @@ class UrdfTest(InFolder):
         for name, size in (("f/1", 0.1), ("f_1", 0.2)):
             shape = hull(size * np.vstack((np.zeros(3), np.eye(3))))
             links.append(replace(frame(name), collisions=(shape,), inertia=np.eye(3) * 2e-13))
-        joints = [
-            fixed("base", link.name, pose((1, 2, 3), rpy=(0.1, 0.2, 0.3))) for link in links[1:]
-        ]
+        joints = []
+        for link, pitch in zip(links[1:], (0.2, np.pi / 2), strict=True):
+            joints.append(fixed("base", link.name, pose((1, 2, 3), rpy=(0.1, pitch, 0.3))))
         tree = RobotTree(name="toy", root="base", links=tuple(links), joints=tuple(joints))
         path = self.folder / "robot.urdf"
         path.write_text(urdf_text(tree, "made by --hand"))
         write_meshes(tree, self.folder)
         read = load_urdf(path)
         self.assertEqual(read.link_names, tree.link_names)
-        assert_allclose(read.joints[0].T_parent_joint, joints[0].T_parent_joint, atol=1e-8)
+        for found, joint in zip(read.joints, joints, strict=True):
+            assert_allclose(found.T_parent_joint, joint.T_parent_joint, atol=1e-8)
         sizes = [float(np.max(link.collisions[0].geometry.vertices)) for link in read.links[1:]]
         assert_allclose(sizes, (0.1, 0.2))
         assert_allclose(read.link("f_1").inertia, np.eye(3) * 2e-13)

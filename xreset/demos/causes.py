@@ -663,8 +663,7 @@ def _origins(r: Recording) -> Iterator[Cause]:
 
 def _advice(r: Recording) -> str:
     """Return what to look at if no cause was found by trying."""
-    fits_hand = not list(_of_hand(r))
-    if not fits_hand:
+    if list(_of_hand(r)):
         return (
             "Are hand and object in the same frame and unit, recorded at the same times, and is the mesh the one that"
             " was tracked?"

@@ -26,7 +26,7 @@ from xreset.demos.examine import examine, refuse_wrong, surfaces_of
 from xreset.demos.hand import ORDERS, Order
 from xreset.errors import DemoError
 from xreset.files.checks import frozen, is_rigid
-from xreset.files.records import RATE, UNIT_TOLERANCE, Arrays, Field, read_npz
+from xreset.files.records import POSITION, RATE, UNIT_TOLERANCE, Arrays, Field, read_npz
 from xreset.files.storage import max_bytes
 from xreset.files.text import is_plain, shown
 from xreset.geometry.shapes import transformed
@@ -47,8 +47,6 @@ _GAP = 0.3
 """Longest time between two frames over which the hand and a moving object are interpolated [s]."""
 _GAP_MOTION = 0.02
 """An object that moves farther in such a time moves [m]."""
-_FARTHEST_CAMERA = 20.0
-"""Distance of a camera from the table, above which its pose is in another unit [m]."""
 _USUAL_RATES = (24 / 1.001, 30 / 1.001, 60 / 1.001, 120 / 1.001)
 """Rates of video that are no whole numbers [1/s]."""
 
@@ -167,7 +165,7 @@ def read_transform(path: str | Path) -> np.ndarray:
             f"{path} holds {T.shape} numbers {shown(T.tolist())}, expected the 4x4 matrix of a rotation and a"
             " translation, with the last row 0 0 0 1."
         )
-    if np.linalg.norm(T[:3, 3]) > _FARTHEST_CAMERA:
+    if np.abs(T[:3, 3]).max() > POSITION[1]:
         raise DemoError(
             f"{path} has the translation {T[:3, 3].tolist()}. Are these millimetres? It must be in metres."
         )

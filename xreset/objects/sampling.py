@@ -16,10 +16,8 @@ Frame = Literal["mesh", "center"]
 """``object_frame`` of a task."""
 METRIC_POINTS = 64
 """Points of the published success (the published paper, section V)."""
-_CANDIDATES_PER_POINT = 8
-"""Samples of the surface that each wanted point is chosen from."""
-_MOST_CANDIDATES = 100_000
-"""Samples from which points are no longer looked for."""
+_CANDIDATES_PER_POINT = (8, 64, 512)
+"""Samples of the surface that each wanted point is chosen from; more where most of the surface is inside."""
 _PROBE = 2e-4
 """Distance from the surface at which a sample is tested [m]: above rounding, below any feature."""
 
@@ -42,14 +40,13 @@ _SURFACE_POINTS: dict[tuple[bytes, int], np.ndarray] = {}
 
 
 def _spread_points(obj: ObjectSpec, count: int) -> np.ndarray:
-    candidates = max(_CANDIDATES_PER_POINT * count, 256)
-    outside = np.empty((0, 3))
-    while len(outside) < count and candidates < _MOST_CANDIDATES:
-        points, _, normals = sample_surface(obj.vertices, obj.faces, candidates)
-        number = winding_number(points + _PROBE * normals, obj.vertices, obj.faces)
-        outside = points[number < 0.5]
-        candidates *= 8  # much of the surface may be inside
-    return farthest_points(outside, count)
+    points = np.empty((0, 3))
+    for each in _CANDIDATES_PER_POINT:
+        if len(points) < count:
+            points, _, normals = sample_surface(obj.vertices, obj.faces, max(each * count, 256))
+            outside = winding_number(points + _PROBE * normals, obj.vertices, obj.faces) < 0.5
+            points = points[outside]
+    return farthest_points(points, count)
 
 
 def metric_points(obj: ObjectSpec, frame: Frame = "mesh") -> np.ndarray:

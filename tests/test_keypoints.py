@@ -198,6 +198,10 @@ class Synthetic(InFolder):
         words = f"nothing is known for 1.1. s after frame {np.argmax(moves)}, in which the object"
         self.refused(words, replace(PLAIN, fps=30.0), time=hole)
         still = time + (np.arange(frames) > 0)
+        quats = self.demos.object_quat_wxyz.copy()
+        quats[0] = (turn_of((1, 0, 0, 1)) * self.turn[0]).as_quat(scalar_first=True)
+        words = "moves by 0 mm and turns by 90 degrees"
+        self.refused(words, replace(PLAIN, fps=30.0), time=still, object_quat_wxyz=quats)
         found = read_keypoints(self.npz(time=still), replace(PLAIN, fps=30.0))
         self.assertEqual(found.num_frames, 3 * (frames + 9) + 3)
         self.assertEqual(np.flatnonzero(~found.hand_valid).tolist(), [*range(1, 33)])

@@ -46,7 +46,7 @@ _SAME_RATE = 1e-3
 _GAP = 0.3
 """Longest time between two frames over which the hand and a moving object are interpolated [s]."""
 _GAP_MOTION = 0.02
-"""An object that moves farther in such a time moves [m]."""
+"""An object of which a point at 10 cm from its origin moves farther in such a time moves [m]."""
 _USUAL_RATES = (24 / 1.001, 30 / 1.001, 60 / 1.001, 120 / 1.001)
 """Rates of video that are no whole numbers [1/s]."""
 
@@ -413,12 +413,14 @@ def _resampled(time: np.ndarray, rate: float, motion: Motion) -> Motion:
     steps = np.diff(time)
     is_gap = steps > max(_GAP, 3 * float(np.median(steps)))
     moves = np.linalg.norm(np.diff(pos, axis=0), axis=1)
-    lost = is_gap & (moves > _GAP_MOTION)
+    turns = (turn[1:] * turn[:-1].inv()).magnitude()
+    lost = is_gap & (moves + 0.1 * turns > _GAP_MOTION)
     if lost.any():
         gap = int(np.argmax(lost))
         raise DemoError(
             f"nothing is known for {steps[gap]:.2f} s after frame {gap}, in which the object moves by"
-            f" {length_text(moves[gap])}. Give the frames before and after as two sequences."
+            f" {length_text(moves[gap])} and turns by {np.degrees(turns[gap]):.0f} degrees. Give the frames before and"
+            " after as two sequences."
         )
     # keypoints next to a frame without a hand become NaN
     points, pos = (interp1d(time, values, axis=0)(at) for values in (points, pos))

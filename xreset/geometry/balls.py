@@ -20,10 +20,8 @@ from torch import Tensor
 from xreset.errors import RobotError
 from xreset.files.checks import frozen
 from xreset.geometry.collision import SelfCollision, bounding_ball, support_points
-from xreset.geometry.fields import DistanceFields
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.shapes import half_spaces, plane_heights, shape_mesh, surface_of, transformed
-from xreset.geometry.solids import link_field
 from xreset.physics.tensors import Tensors
 from xreset.spec import Geometry, Shape
 
@@ -48,7 +46,7 @@ _INWARD_STEPS = 8
 
 @frozen
 class Balls(Tensors):
-    """Balls fixed to the links of a hand, and those links as solids that the balls of other links stay out of."""
+    """Balls fixed to the links of a hand."""
 
     links: tuple[str, ...]
     """Links that carry balls (length G)."""
@@ -74,8 +72,6 @@ class Balls(Tensors):
     """[G] first guard of each link."""
     guard_count: Tensor
     """[G] number of guards of each link."""
-    fields: DistanceFields
-    """Signed distances to the G links, in their frames."""
     link_pairs: Tensor
     """[H, 2] pairs of links, as indices of ``links``: the guards of the first keep out of the second. Each pair occurs
     both ways."""
@@ -128,7 +124,6 @@ def hand_balls(hand: Kinematics, collision: SelfCollision) -> Balls:
         guard_radii=joined(guard_radii),
         first_guard=first_guard,
         guard_count=guard_count,
-        fields=DistanceFields.join([link_field(shapes) for shapes in solids.values()]),
         link_pairs=torch.as_tensor(both_ways.reshape(-1, 2)),
     )
 
@@ -174,9 +169,11 @@ def _apart(centers: np.ndarray, radii: np.ndarray, spacing: float) -> np.ndarray
     """Choose balls that are farther from each other than ``spacing`` [m], larger ones first; return their rows,
     ascending."""
     kept = []
+    is_apart = np.ones(len(centers), dtype=bool)
     for ball in np.argsort(-radii, kind="stable").tolist():
-        if not kept or np.linalg.norm(centers[kept] - centers[ball], axis=1).min() > spacing:
+        if is_apart[ball]:
             kept.append(ball)
+            is_apart &= np.linalg.norm(centers - centers[ball], axis=1) > spacing
     return np.sort(np.array(kept, dtype=np.int64))
 
 

@@ -111,7 +111,7 @@ def contact_distance(model: HandModel, bodies: Bodies, points: Tensor) -> Tensor
             body = model.group_body[link]
             local = matvec(bodies.rot[:, body].mT, points[:, keypoint] - bodies.pos[:, body])
             index = torch.full((len(local),), link, device=local.device)
-            gaps.append(model.balls.fields.signed_distance(local, index)[0])
+            gaps.append(model.solids.signed_distance(local, index)[0])
         distance[:, keypoint] = torch.stack(gaps).amin(dim=0).abs()
     return distance
 
@@ -178,7 +178,7 @@ def _in_each_other(
     )
     reach = balls.half_sizes.norm(dim=-1)
     apart = (middles[:, a] - middles[:, b]).norm(dim=-1)
-    near = apart < reach[a] + reach[b] + max(margin, 0.0) + balls.fields.spacing[b]
+    near = apart < reach[a] + reach[b] + max(margin, 0.0) + model.solids.spacing[b]
     frame, pair = (near & considered[:, None]).nonzero(as_tuple=True)
     # The guards of the first link of a pair are looked at in the frame of the second.
     first = model.group_body[a]
@@ -186,13 +186,13 @@ def _in_each_other(
     inverse = bodies.rot[frame, second[pair]].mT
     turn = inverse @ bodies.rot[frame, first[pair]]
     shift = matvec(inverse, bodies.pos[frame, first[pair]] - bodies.pos[frame, second[pair]])
-    meet = _boxes_meet(model, turn, shift, a[pair], balls.fields, b[pair], margin)
+    meet = _boxes_meet(model, turn, shift, a[pair], model.solids, b[pair], margin)
     frame = frame[meet]
     pair = pair[meet]
     owner, guard = members(balls.first_guard[a[pair]], balls.guard_count[a[pair]])
     ball = balls.guards[guard]
     local = _placed(turn[meet], shift[meet], owner, balls.centers[ball])
-    near, distance, away = balls.fields.nearer(
+    near, distance, away = model.solids.nearer(
         local, b[pair[owner]], balls.guard_radii[guard] - self_depth
     )
     frame = frame[owner[near]]

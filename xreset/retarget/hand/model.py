@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from itertools import pairwise
 
 import numpy as np
@@ -23,6 +23,8 @@ from xreset.geometry.collision import SelfCollision
 from xreset.geometry.fields import DistanceFields
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import homogeneous, matvec, quat_to_matrix
+from xreset.geometry.solids import link_field
+from xreset.geometry.urdf import robot_tree
 from xreset.physics.tensors import Tensors
 from xreset.spec import FINGERS, KEYPOINTS, RobotSpec, TableSpec
 
@@ -79,9 +81,17 @@ class HandState(Tensors):
 
 @lru_cache(maxsize=8)
 def _balls_of(robot: RobotSpec, fingerprint: str) -> Balls:
-    """Fill a robot's hand, which takes up to a second, once in a process; the fingerprint is also of its files."""
+    """Fill a robot's hand, which takes a while, once in a process; the fingerprint is also of its files."""
     hand = Kinematics(robot, root=robot.hand_root)
     return hand_balls(hand, SelfCollision(hand, only=robot.self_collision_links))
+
+
+@lru_cache(maxsize=8)
+def _solids_of(robot: RobotSpec, fingerprint: str) -> DistanceFields:
+    """Return the distances to the links that have balls, which take longer than the balls, once in a process."""
+    tree = robot_tree(robot)
+    links = _balls_of(robot, fingerprint).links
+    return DistanceFields.join([link_field(tree.link(name).collisions) for name in links])
 
 
 class HandModel:
@@ -149,6 +159,11 @@ class HandModel:
         """[G] index among the bodies of each link with balls."""
         self.keypoint_groups = [self._links_with(link) for link in self.keypoint_links]
         """Links with balls that move together with each keypoint's link, as indices of ``balls.links`` (length P)."""
+
+    @cached_property
+    def solids(self) -> DistanceFields:
+        """Signed distances to the links with balls, in their frames; balls of other links stay out of them."""
+        return _solids_of(self.robot, self.robot.fingerprint).to(self.device)
 
     def _links_with(self, link: str) -> list[int]:
         """Return the links with balls of a link's rigid body, as indices of ``balls.links``."""

@@ -40,21 +40,11 @@ class FaceTest(TestCase):
             xreset.no_such_name  # noqa: B018
 
     def test_every_type_in_the_signature_of_a_function_is_a_public_name(self):
-        elsewhere = {"Path", "Callable", "Sequence", "Iterable", "Mapping"}
-        elsewhere |= {
-            "Module",
-            "Literal",
-            "None",
-            "Any",
-            "Self",
-            "Data",
-            "PositiveInt",
-            "PositiveFloat",
-            "Seed",
-        }
-        # of functions that are commands, too
-        elsewhere |= {"Annotated", "Device", "Option", "Output", "Port", "Pose", "Png", "Rate"}
-        elsewhere |= {"Progress", "NamedProgress", "OutputFile", "ArchiveFile", "Onnx", "Mp4"}
+        python = "Path Callable Sequence Iterable Mapping Module Literal None Any Self"
+        ours = "Data PositiveInt PositiveFloat Seed"
+        of_commands = "Annotated Device Option Output Port Pose Png Rate Progress NamedProgress"
+        of_commands += " OutputFile ArchiveFile Onnx Mp4"
+        elsewhere = {*python.split(), *ours.split(), *of_commands.split()}
         functions = 0
         for name in xreset.__all__:
             value = getattr(xreset, name)

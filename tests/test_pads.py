@@ -151,11 +151,11 @@ class PushTest(TestCase):
         with patch("xreset.retarget.pipeline._push_out", push_out):
             after = retarget_demos(demos, self.robot, objects, config)
         (before,) = given
-        is_deep = before.object_depth > 0.002
-        deep = (before.reason == 0) & is_deep
+        fine = before.reason == 0
+        deep = fine & (before.object_depth > 0.002)
         self.assertGreater(deep.sum(), 10)
         self.assertGreater(after.valid[deep].sum(), 0.8 * deep.sum())
-        self.assertTrue(after.valid[(before.reason == 0) & ~is_deep].all())
+        self.assertTrue(after.valid[fine & ~deep].all())
         moved = (after.joint_pos != before.joint_pos).any(axis=1)
         assert_array_equal(moved, deep & after.valid)
         self.assertLessEqual(after.object_depth[after.valid].max(), 0.002)

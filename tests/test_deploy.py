@@ -25,7 +25,7 @@ from tests.command import refused, succeeds
 from tests.data import InFolder, refuses
 from tests.test_examples import EXAMPLES, run
 from tests.toy_bank import SOUP
-from tests.toy_policy import graph_of, toy_graph
+from tests.toy_policy import TASK, graph_of, toy_graph
 from tests.toy_robot import endless_robot
 from xreset import (
     CameraConfig,
@@ -45,7 +45,7 @@ from xreset.live.leapp import leapp_description
 from xreset.policy.onnx_policy import OnnxPolicy
 from xreset.runtime import Controller, LiveError, Reading, load_controller
 from xreset.runtime.contract import KEY, parse_contract
-from xreset.task.config import ObservationConfig, evaluation_task
+from xreset.task.config import ObservationConfig
 
 POLICY = "many-objects"
 STEPS = 30
@@ -122,7 +122,7 @@ class ToyTest(InFolder):
     def setUpClass(cls):
         super().setUpClass()
         cls.robot = toy_grasp.robot()
-        cls.task = evaluation_task(TaskConfig())
+        cls.task = TASK
 
     def setUp(self):
         super().setUp()
@@ -169,7 +169,7 @@ class ToyTest(InFolder):
             ["target", "memory_out", "links", "observations"],
         )
         shapes = self.controller.shapes
-        self.assertNotIn("object_center", shapes, "the draft's observations do not need it")
+        self.assertEqual(shapes["object_center"], (3,))
         self.assertEqual((shapes["joint_pos"], shapes["tip_force"]), ((5,), (2, 3)))
         self.assertEqual(
             [joint["name"] for joint in self.contract["joints"]], list(self.robot.joint_names)
@@ -532,7 +532,9 @@ class EndlessTest(InFolder):
         start[0] = turned
         nowhere = np.zeros(3)
         upright = np.array([1.0, 0, 0, 0])
-        controller.begin(np.zeros(controller.shapes["object_points"]), nowhere, upright, start)
+        controller.begin(
+            np.zeros(controller.shapes["object_points"]), nowhere, upright, start, nowhere
+        )
         reading = Reading(
             joint_pos=start,
             joint_vel=np.zeros_like(start),

@@ -423,6 +423,9 @@ class EngineTest(TestCase):
         for name in ("paper", "default", "live", "published"):
             with self.subTest(name):
                 self._check(evaluation_task(RECIPES[name].config.task))
+        task = evaluation_task(TaskConfig())
+        observation = replace(task.observation, policy={"rotation_from_start": {}})
+        self._check(replace(task, observation=observation))
 
     def _check(self, task):
         played = toy_grasp.trial(task)

@@ -33,7 +33,7 @@ class FaultyDriverTest(TestCase):
     def setUp(self):
         self.trial = toy_grasp.trial(evaluation_task(TaskConfig()))
 
-    def play(self, faults=None, *, worlds=1, seed=0):
+    def play(self, faults=None, *, worlds=1, seed=0, gain=1.0):
         """Close and lift; returns the readings of all steps, and the targets of the first world's drives."""
         index = torch.zeros(worlds, dtype=torch.long)
         readings = []
@@ -41,6 +41,7 @@ class FaultyDriverTest(TestCase):
         with self.trial.worlds(engine("mujoco", workers=0), index) as env:
             env.reset(start=self.trial.starts().home(index, torch.Generator().manual_seed(0)))
             env.backend.set_state(toy_grasp.start()[index])
+            env.variation.force_gain = gain
             driver = EngineDriver(env)
             if faults is not None:
                 driver = FaultyDriver(env, faults, [(seed, 1)] * worlds)
@@ -62,6 +63,11 @@ class FaultyDriverTest(TestCase):
         for plain, faulty in zip(self.play()[0], self.play(Faults())[0], strict=True):
             for name in ("joint_pos", "object_pos", "object_quat", "object_time", "tip_force"):
                 assert_array_equal(getattr(plain, name), getattr(faulty, name))
+
+    def test_forces_are_read_with_their_gain(self):
+        true, weak = (self.play(gain=gain)[0][-1].tip_force for gain in (1.0, 0.5))
+        self.assertGreater(true.max(), 1)
+        assert_allclose(weak, 0.5 * true)
 
     def test_each_fault_does_what_it_says(self):
         step = 1 / 60

@@ -14,6 +14,8 @@ from xreset.live.deploy import deployed_graph
 from xreset.policy.onnx_policy import observation_shapes, parsed_contract, policy_contract
 from xreset.task.config import TaskConfig, evaluation_task
 
+TASK = evaluation_task(TaskConfig(object_frame="center"))
+
 
 @cache
 def toy_graph():
@@ -23,11 +25,10 @@ def toy_graph():
 
 def graph_of(robot, *objects, value):
     """Return the network of a policy of a robot, with one value for all weights, and the policy as one graph."""
-    task = evaluation_task(TaskConfig())
-    trained = asdict(policy_contract(robot, task, tuple(obj.name for obj in objects)))
+    trained = asdict(policy_contract(robot, TASK, tuple(obj.name for obj in objects)))
     with tempfile.TemporaryDirectory() as folder:
         network = write_policy(Path(folder) / "toy.onnx", trained, value=value).read_bytes()
-    return network, deployed_graph(network, robot, task, objects)
+    return network, deployed_graph(network, robot, TASK, objects)
 
 
 def write_policy(

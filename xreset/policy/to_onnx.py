@@ -7,9 +7,7 @@ import io
 import logging
 import warnings
 from collections.abc import Iterator, Sequence
-from functools import cache
-from typing import TYPE_CHECKING, Any
-from unittest.mock import patch
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
@@ -44,7 +42,7 @@ def exported_module(
         import onnxscript  # noqa: F401  torch's exporter needs it
 
     worlds = torch.export.Dim("worlds", min=1, max=65536)
-    with _quiet(), _one_table(), torch.no_grad():
+    with _quiet(), torch.no_grad():
         program = torch.onnx.export(
             module,
             tuple(example.values()),
@@ -74,19 +72,6 @@ def _drop_notes(model: ModelProto) -> None:
     ):
         del noted.metadata_props[:]
         noted.doc_string = ""
-
-
-@cache
-def _one_table() -> Any:
-    """Return a context in which torch fills its table of operators once in a process, and not in each export, which
-    takes a third of a small one's time."""
-    try:
-        from torch.onnx._internal.exporter._registration import ONNXRegistry
-
-        table = cache(ONNXRegistry.from_torchlib)
-    except (ImportError, AttributeError):  # another version of torch
-        return contextlib.nullcontext()
-    return patch.object(ONNXRegistry, "from_torchlib", staticmethod(table))
 
 
 @contextlib.contextmanager

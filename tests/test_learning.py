@@ -5,7 +5,7 @@ import json
 import math
 from dataclasses import asdict, replace
 from unittest import TestCase, skipUnless
-from unittest.mock import patch
+from unittest.mock import Mock, patch
 
 import numpy as np
 import torch
@@ -398,6 +398,14 @@ class ExportTest(InFolder):
         with torch.no_grad():
             for t in range(50):
                 assert_close(policy.act(seen(t)), model(seen(t)).clamp(-1, 1), atol=1e-5, rtol=0)
+        begun = policy.another()
+        begun.act(seen(1))
+        with patch("xreset.policy.onnx_policy.check_contract"):
+            begun.begin(Mock())
+        first = OnnxPolicy(file).act(seen(0))
+        for fresh in (policy.another(), begun):
+            self.assertTrue(fresh.act(seen(0)).equal(first), "no episode remembers another")
+        self.assertFalse(policy.act(seen(0)).equal(first))
 
 
 class CheckpointTest(InFolder):

@@ -2,7 +2,7 @@
 
 import unittest
 
-from tests.toy_learning import WORLDS, random_policy, scene, trained
+from tests.toy_learning import CONFIG, WORLDS, random_policy, scene, trained
 from xreset.backends.mujoco import MujocoBackend
 
 MARGIN = 0.4
@@ -13,6 +13,10 @@ class Learns(unittest.TestCase):
     def test_a_training_beats_a_random_policy(self):
         with MujocoBackend(scene(), WORLDS, workers=0) as backend:
             by_chance = random_policy(1, backend)
-            enough = by_chance["grasped"] + MARGIN
-            learned, _ = trained(1, backend, enough=enough)
-        self.assertGreater(learned["grasped"], enough, f"trained: {learned}")
+            learned, steps = trained(1, backend)
+        self.assertEqual(steps, CONFIG.iterations * CONFIG.ppo.horizon * WORLDS, "it was stopped")
+        self.assertGreater(
+            learned["grasped"],
+            by_chance["grasped"] + MARGIN,
+            f"a random policy: {by_chance}; trained: {learned}",
+        )

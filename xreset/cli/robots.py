@@ -42,10 +42,10 @@ def list_robots() -> None:
 
 
 def _show_check(findings: Sequence[Finding], options: Mapping[str, Any]) -> None:
-    from xreset.robot_tools.check import LAST
+    from xreset.robot_tools.check import can_be_drawn
 
     _print_findings(findings)
-    if options["picture"] and findings[-1].topic == LAST:
+    if options["picture"] and can_be_drawn(findings):
         console.print(f"wrote {options['picture']}")
     if any(finding.level == "error" for finding in findings):
         raise SystemExit(1)

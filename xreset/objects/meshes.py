@@ -113,8 +113,8 @@ def import_with_notes(path: str | Path, name: str) -> Import:
         ObjectError: the file is missing, damaged, empty or flat, or not in metres.
     """
     path = Path(path)
-    mesh = read_mesh(path)
-    notes = mesh.metadata["notes"]
+    notes: list[str] = []
+    mesh = read_mesh(path, notes)
     mesh = _without_specks(mesh, notes)
     own = properties_of(path)
     known = _known_mass(name, own)
@@ -260,7 +260,8 @@ def add_mesh(
     refuse_taken(target, known)
     from trimesh.exchange.obj import export_obj
 
-    mesh = read_mesh(path, scale=scale)
+    notes: list[str] = []
+    mesh = read_mesh(path, notes, scale=scale)
     text = export_obj(
         mesh, include_normals=False, include_color=False, include_texture=False, header=""
     )
@@ -274,14 +275,15 @@ def add_mesh(
             raise ObjectError(str(error).replace(str(draft), str(path))) from error
     write_whole(target.with_suffix(".toml"), known)
     write_whole(target, text)
-    return replace(result, notes=(*mesh.metadata["notes"], *result.notes))
+    return replace(result, notes=(*notes, *result.notes))
 
 
-def read_mesh(path: Path, *, scale: float = 1.0) -> trimesh.Trimesh:
+def read_mesh(path: Path, notes: list[str], *, scale: float = 1.0) -> trimesh.Trimesh:
     """Read the triangles of a file, in metres, joined where they touch.
 
     Args:
         path: file of any format that trimesh reads, but not an archive.
+        notes: gets a line if triangles were turned.
         scale: metres in a unit of the file.
 
     Raises:
@@ -293,14 +295,14 @@ def read_mesh(path: Path, *, scale: float = 1.0) -> trimesh.Trimesh:
     try:
         if scale != 1.0:
             mesh.apply_scale(scale)
-        return _checked(mesh, path)
+        return _checked(mesh, path, notes)
     except ObjectError:
         raise
     except Exception as error:  # trimesh raises any kind of error
         raise ObjectError(f"{path} cannot be read as a mesh: {shown(str(error))}") from error
 
 
-def _checked(mesh: trimesh.Trimesh, path: Path) -> trimesh.Trimesh:
+def _checked(mesh: trimesh.Trimesh, path: Path, notes: list[str]) -> trimesh.Trimesh:
     """Return the mesh, joined where triangles of a part touch; see :func:`read_mesh` for errors."""
     if not np.isfinite(mesh.vertices).all():
         raise ObjectError(f"{path} has a vertex that is not finite; it is damaged.")
@@ -318,10 +320,9 @@ def _checked(mesh: trimesh.Trimesh, path: Path) -> trimesh.Trimesh:
     if not len(mesh.faces) or mesh.extents.min() < _FLAT:
         raise ObjectError(f"{path} is flat: {_size(mesh)}; a solid object is needed.")
     mesh = _parted(mesh)
-    mesh.metadata["notes"] = []
     if mesh.is_watertight and mesh.is_winding_consistent:
         if _turn_outward(mesh):
-            mesh.metadata["notes"].append(_TURNED)
+            notes.append(_TURNED)
         least, middle, largest = np.linalg.eigvalsh(mesh.moment_inertia)
         if min(least, least + middle - 0.999 * largest) <= 0:
             raise ObjectError(

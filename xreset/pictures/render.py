@@ -307,7 +307,7 @@ def _image(
     return image.resize((2 * width, 2 * height), Image.Resampling.NEAREST)
 
 
-@lru_cache(maxsize=4)  # all pictures of a film have the same
+@lru_cache(maxsize=1)  # all pictures of a film have the same
 def _rays(camera: Camera, size: Size) -> np.ndarray:
     """[H * W, 3] float32 directions of the pixels' rays, row by row; their length along the view axis is 1."""
     width, height = size

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -34,7 +34,7 @@ MOST_TOUCHING = 0.2
 """Share of the joint positions around home at which a robot may touch itself without a warning."""
 _LIMIT_SLACK = 1e-3
 """[rad or m] How far a mimic joint's limits may fall short of its source's: published figures are rounded."""
-LAST = "retargeting"
+_LAST = "retargeting"
 """Topic of the last finding about a robot that can be loaded."""
 _LISTED = 4
 """Pairs of links that are named, most frequent first."""
@@ -115,8 +115,13 @@ def check(name_or_folder: str | Path) -> list[Finding]:
     )
     found += _topic("home and table", _above_table(kinematics, q))
     found += _topic("home and self", _free_of_itself(kinematics, q))
-    found += _topic(LAST, _size(spec))
+    found += _topic(_LAST, _size(spec))
     return found
+
+
+def can_be_drawn(findings: Sequence[Finding]) -> bool:
+    """Return whether a check got to its end: the robot can be loaded, and has a home."""
+    return findings[-1].topic == _LAST
 
 
 Problems = Iterator[tuple[Level, str]]

@@ -305,9 +305,8 @@ class Hand:
         first = self._find_thumb(chains, thumb)
         others = [chain for chain in chains if chain is not first]
         names = {chain.name for chain in others}
-        is_jaw = (
-            len(others) == 1 and first.name != "thumb"
-        )  # lf and rf may be a left and a right jaw
+        # lf and rf may be a left and a right jaw
+        is_jaw = len(others) == 1 and first.name != "thumb"
         if not names <= set(_FINGERS) or len(names) < len(others) or is_jaw:
             if len(others) > len(_FINGERS):
                 raise RobotError(

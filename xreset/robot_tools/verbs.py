@@ -48,11 +48,11 @@ def check_robot(robot: str | Path, *, picture: Png | None = None) -> list[Findin
     """
     from xreset.geometry.description import load_robot
     from xreset.pictures.render import write_png
-    from xreset.robot_tools.check import LAST, check
+    from xreset.robot_tools.check import can_be_drawn, check
     from xreset.robot_tools.picture import robot_picture
 
     found = check(robot)
-    if picture is not None and found[-1].topic == LAST:
+    if picture is not None and can_be_drawn(found):
         write_png(Path(picture), robot_picture(load_robot(robot)))
     return found
 

@@ -227,7 +227,8 @@ class Runner:
         running = self._running
         is_new = np.asarray(now - reading.object_time <= self.limits.pose_age)
         is_new &= now - reading.joint_time <= self.limits.joint_age
-        is_new &= np.isfinite(reading.object_time + reading.joint_time)  # some were sound
+        # the time is -inf until the first sound reading, and the ages may be unlimited
+        is_new &= np.isfinite(reading.object_time + reading.joint_time)
         if not running.any() or not is_new[running].all():
             return self._sent
         try:

@@ -421,7 +421,7 @@ class MeshImport(InFolder):
                 patch("xreset.geometry.shapes.max_bytes", return_value=limit),
                 refuses(self, words, ObjectError, name),
             ):
-                read_mesh(self.folder / name, [])
+                read_mesh(self.folder / name)
 
     def test_the_command_puts_a_mesh_into_a_folder_and_draws_it(self):
         path = self.write(trimesh.creation.box((100, 60, 40)))
@@ -579,7 +579,7 @@ class ThinWalls(InFolder):
             touching = trimesh.util.concatenate([CUBE, CUBE.copy().apply_translation(shift)])
             path = self.folder / "touching.obj"
             touching.export(path)
-            mesh = read_mesh(path, [])
+            mesh = read_mesh(path)
             with self.subTest(shift):
                 self.assertTrue(mesh.is_volume)
                 pieces = decompose(mesh)
@@ -596,7 +596,7 @@ class ThinWalls(InFolder):
         path = self.folder / "pan.stl"
         trimesh.util.concatenate([CUBE, handle, space]).export(path)
         volume = 0.1**3 - 0.08**3 + 0.08 * 0.02**2
-        self.assertAlmostEqual(read_mesh(path, []).volume, volume, delta=1e-9)
+        self.assertAlmostEqual(read_mesh(path).volume, volume, delta=1e-9)
         trimesh.util.concatenate([CUBE, handle]).export(path)
         found = add_mesh(path, self.folder / "out", "pan", properties=Properties(mass=1.0))
         self.assertRegex(*found.notes, "^triangles face inwards, and were turned")

@@ -278,12 +278,12 @@ def add_mesh(
     return replace(result, notes=(*notes, *result.notes))
 
 
-def read_mesh(path: Path, notes: list[str], *, scale: float = 1.0) -> trimesh.Trimesh:
+def read_mesh(path: Path, notes: list[str] | None = None, *, scale: float = 1.0) -> trimesh.Trimesh:
     """Read the triangles of a file, in metres, joined where they touch.
 
     Args:
         path: file of any format that trimesh reads, but not an archive.
-        notes: gets a line if triangles were turned.
+        notes: gets a line if triangles were turned; None: nobody reads it.
         scale: metres in a unit of the file.
 
     Raises:
@@ -295,7 +295,7 @@ def read_mesh(path: Path, notes: list[str], *, scale: float = 1.0) -> trimesh.Tr
     try:
         if scale != 1.0:
             mesh.apply_scale(scale)
-        return _checked(mesh, path, notes)
+        return _checked(mesh, path, [] if notes is None else notes)
     except ObjectError:
         raise
     except Exception as error:  # trimesh raises any kind of error

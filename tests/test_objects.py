@@ -484,6 +484,9 @@ class MeshImport(InFolder):
             cut.assert_not_called()
 
     def test_layouts(self):
+        (self.folder / "mug.STL").touch()
+        with self.assertRaisesRegex(ObjectError, "no mesh in .* xreset objects import MESH --out"):
+            mesh_files(self.folder)
         self.write(CUBE, "011_banana")
         for name in ("025_mug/textured", "025_mug/textured_simple", "024_bowl/textured"):
             path = self.folder / f"{name}.obj"
@@ -506,11 +509,13 @@ class MeshImport(InFolder):
             (self.folder / "nowhere", "no folder"),
         ):
             self.assertRaisesRegex(ObjectError, words, load_object, "soup", folder)
-        self.write(CUBE, "024_bowl")
+        self.write(CUBE, "024_bowl").rename(self.folder / "024_bowl.OBJ")
         with self.assertRaisesRegex(
-            ObjectError, "024_bowl.obj and .*textured.obj have the same name"
+            ObjectError, "024_bowl.OBJ and .*textured.obj have the same name"
         ):
             mesh_files(self.folder)
+        (self.folder / "024_bowl/textured.obj").unlink()
+        self.assertEqual(load_object("bowl", self.folder).mass, 0.3)
 
     def test_a_real_can_stays_whole(self):
         obj = load_object("soup", data_dir() / "ycb")

@@ -41,7 +41,7 @@ def mesh_files(folder: str | Path) -> dict[str, Path]:
         raise ObjectError(f"{folder} is a file, not a folder of meshes. {expected}")
     if not os.path.isdir(folder):
         raise ObjectError(f"There is no folder {shown(str(folder))}. {expected}")
-    found = {path.stem: path for path in folder.glob("[!.]*.obj")}
+    found = {path.stem: path for path in folder.glob("[!.]*.[oO][bB][jJ]")}
     nested = {}
     for file in ("textured.obj", "textured_simple.obj"):  # the simpler one wins
         nested |= {path.parent.name: path for path in folder.glob(f"*/{file}")}
@@ -51,7 +51,8 @@ def mesh_files(folder: str | Path) -> dict[str, Path]:
         )
     found |= nested
     if not found:
-        raise ObjectError(f"There is no mesh in {folder}. {expected}")
+        advice = f"Import other formats: xreset objects import MESH --out {folder}"
+        raise ObjectError(f"There is no mesh in {folder}. {expected} {advice}")
     return dict(sorted(found.items()))
 
 

@@ -158,7 +158,7 @@ class PolicySpec(Brief, Checked):
         if is_deployed(content):
             return content
         graph = graph_of(content)
-        if graph and Controller(graph).contract["robot_fingerprint"] == self.robot.fingerprint:
+        if graph and f'"robot_fingerprint": "{self.robot.fingerprint}"'.encode() in graph:
             return graph
         if self.task.vision.cameras:
             raise PolicyError(

@@ -95,6 +95,12 @@ def recorded(name, object_name, steps):
 
 
 class RuntimeTest(InFolder):
+    def test_the_graph_that_ships_is_not_that_of_a_changed_robot(self):
+        spec = load_policy(POLICY)
+        changed = replace(spec, robot=replace(spec.robot, home_std=(0.0, 0.0)))
+        with self.assertRaisesRegex(PolicyError, "another version of the robot"):
+            _ = changed.graph
+
     def test_it_acts_as_the_evaluation_in_a_process_without_xreset(self):
         said = succeeds("export deploy", POLICY, "--out", f"{self.folder}/can")
         self.assertIn("28 joints at 30 Hz", said)

@@ -302,6 +302,7 @@ def run_study(
 
     todo = planned(texts(runs))
     wanted = [step for step in todo.steps.values() if only in ("all", step.kind)]
+    report_folder = Path(out) / "reports" / todo.name
     if dry_run:
         for step in wanted:
             left, commands = step.todo()
@@ -310,6 +311,8 @@ def run_study(
             say(f"{step.name}: {left or 'done'}{waits}")
             for command in commands:
                 say(f"    {launch.shown_command(command)}")
+        if only in ("all", "tables"):
+            say(f"page: {report_folder / 'index.html'}")
         return
     problems = []
     if only != "tables":
@@ -317,7 +320,7 @@ def run_study(
             subset.make()
         problems = launch.launch(todo, wanted, say)
     if only in ("all", "tables"):
-        written = report.write_page(planned(), Path(out) / "reports" / todo.name)
+        written = report.write_page(planned(), report_folder)
         for text in written.notes:
             note(text)
         say(f"page: {written.page}")

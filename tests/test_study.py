@@ -565,4 +565,7 @@ class WholeTest(InOneFolder):
             said,
             r"(?s)train x-reset-seed0: not begun \(after data .*\n    xreset train --out .*/none/x-reset-seed0 --iterations 2",
         )
+        self.assertIn("none/reports/seconds/index.html", said.splitlines()[-1])
+        only = succeeds("study seconds --out", f"{self.folder}/none", "--dry-run --only tables")
+        self.assertEqual(only, said.splitlines(keepends=True)[-1])
         self.assertFalse((self.folder / "none").exists())

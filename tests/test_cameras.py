@@ -122,6 +122,12 @@ class TestCameras(TestCase):
         )
         self.assertTrue(((points > low - 1e-3) & (points < high + 1e-3)).all())
 
+    def test_points_are_where_a_camera_that_has_not_moved_would_see_them(self):
+        cameras = self.cameras(replace(VISION, cameras=(ABOVE,), points=20))
+        expected = self.look(cameras)[:, 0, :, 2].max()
+        cameras.shift[..., 2] = 0.1  # down
+        self.assertAlmostEqual(self.look(cameras)[:, 0, :, 2].max(), expected + 0.1, delta=1e-4)
+
     def test_a_picture_may_show_the_goal_in_green(self):
         cameras = self.cameras()
         self.look(cameras)

@@ -1,5 +1,6 @@
 """Files: whole or not at all, checked before use; typed configuration; the reset bank's refusals."""
 
+import fcntl
 import io
 import json
 import os
@@ -9,7 +10,7 @@ import sys
 import threading
 import tracemalloc
 import zipfile
-from contextlib import chdir, contextmanager
+from contextlib import ExitStack, chdir, contextmanager
 from dataclasses import asdict, dataclass, replace
 from errno import EACCES, EMFILE, ENOSPC
 from typing import ClassVar, Literal
@@ -205,6 +206,24 @@ class ClaimTest(InFolder):
         self.assertEqual((self.folder / "a").read_bytes(), b"whole")
         self.assertTrue((self.folder / "b" / "c").exists())
 
+    def test_the_lock_of_a_file_that_was_replaced_meanwhile_is_none(self):
+        """The command that held it has ended, and a third one has begun."""
+        others = self.enterContext(ExitStack())
+        lock = fcntl.flock
+
+        def late(*args):
+            held.side_effect = lock
+            (self.folder / ".file.npz.lock").unlink()
+            others.enter_context(claim(self.file))
+            lock(*args)
+
+        with (
+            patch("fcntl.flock", side_effect=late) as held,
+            self.assertRaisesRegex(XResetError, "another command is writing"),
+            claim(self.file),
+        ):
+            self.fail("two writers")
+
     def test_a_claim_waits_for_a_command_that_ends(self):
         looking = claim(self.folder)
         looking.__enter__()
@@ -266,6 +285,14 @@ class JsonTest(InFolder):
             path.write_text(text, encoding="latin-1")
             with self.subTest(text), self.refused(words):
                 read_json(path)
+        path.write_text("{" + " " * (1 << 20) + "}")
+        with patch.dict(os.environ, XRESET_MAX_FILE_MB="17"):
+            self.assertEqual(read_json(path), {})
+        with (
+            patch.dict(os.environ, XRESET_MAX_FILE_MB="16"),
+            self.refused("has 1 MB, too many for JSON"),
+        ):
+            read_json(path)
         path.write_text('{"schema": "x/1"}')
         with self.refused("schema version 'x/1'", "reads 'x/2'"):
             read_json(path, "x/2")

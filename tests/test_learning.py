@@ -19,6 +19,7 @@ from tests.toy_training import CONFIG
 from xreset import VisionConfig, robots
 from xreset.errors import FileFormatError
 from xreset.files.checks import from_dict, merged
+from xreset.learning import distillation
 from xreset.learning.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from xreset.learning.config import ModelConfig, PpoConfig, TrainConfig
 from xreset.learning.distributed import Processes
@@ -346,6 +347,27 @@ class UpdateTest(TestCase):
                     alg.update()
                     self.assertAlmostEqual(alg.learning_rate, expected, delta=1e-9)
                     self.assertEqual(alg.optimizer.param_groups[0]["lr"], alg.learning_rate)
+
+
+class DistillationTest(TestCase):
+    def test_a_student_that_is_its_teacher_has_nothing_to_learn(self):
+        """Also where an episode ends within a rollout."""
+        first = torch.zeros(T + 1, N, dtype=torch.bool)
+        first[[2, 6], [1, 0]] = True
+        obs = with_real_history(observations(T + 1, N), first)
+        ppo = PpoConfig(horizon=T, sequence_length=L, minibatch_size=10**6, mini_epochs=1)
+        config = TrainConfig(model=replace(SMALL, initial_std=0.1), ppo=ppo)
+        with patch.multiple(distillation, OnnxPolicy=Mock(), network_of=Mock()):
+            alg = distillation.SequenceDistillation(obs[0], A, config, "cpu", Processes(), Mock())
+        alg.teacher = copy.deepcopy(alg.student)
+        with torch.no_grad():
+            for t in range(T):
+                alg.act(obs[t])
+                alg.process_env_step(obs[t + 1], torch.zeros(N), first[t + 1], {})
+        self.assertLess(alg.update()["behavior"], 1e-10)
+        alg.teacher.mlp[-1].bias.data += 3.0
+        alg.act(obs[T])
+        self.assertEqual(alg.transition.privileged_actions.unique().tolist(), [1.0])
 
 
 class ReturnCriticTest(TestCase):

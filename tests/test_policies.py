@@ -113,6 +113,8 @@ class OnnxPolicyTest(WithPolicy):
         for _ in range(2):
             self.assertTrue((loaded.start(None).act(observed) == expected).all())
         self.assertEqual(sha256(loaded.exported()).hexdigest(), loaded.hash)
+        larger = {name: 9.0 * value for name, value in observed.items()}
+        self.assertTrue((OnnxPolicy(path).act(larger) == -1.0).all())
 
     def test_a_training_checkpoint_is_recognised(self):
         run = self.folder / "run"

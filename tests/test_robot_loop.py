@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 from unittest import TestCase
-from unittest.mock import patch
+from unittest.mock import Mock, patch
 
 import numpy as np
 import torch
@@ -21,6 +21,7 @@ from xreset.eval.effects import verdict
 from xreset.eval.policy_spec import load_policy
 from xreset.eval.results import read_evaluation
 from xreset.eval.rollout import Round, engine, play_rounds
+from xreset.geometry.shapes import turn_of
 from xreset.live.engine import EngineDriver
 from xreset.live.faults import Faults, FaultyDriver
 from xreset.policy.shipped import shipped
@@ -42,6 +43,8 @@ class FaultyDriverTest(TestCase):
             env.reset(start=self.trial.starts().home(index, torch.Generator().manual_seed(0)))
             env.backend.set_state(toy_grasp.start()[index])
             env.variation.force_gain = gain
+            wrench = env.backend.set_object_wrench
+            self.wrench = env.backend.set_object_wrench = Mock(side_effect=wrench)
             driver = EngineDriver(env)
             if faults is not None:
                 driver = FaultyDriver(env, faults, [(seed, 1)] * worlds)
@@ -54,10 +57,14 @@ class FaultyDriverTest(TestCase):
         return readings, np.stack(targets)
 
     def poses(self, faults):
-        """Return time stamps [T] and positions [T, 3] of the poses that are read with faults."""
+        """Return time stamps [T] of the poses that are read with faults, and their positions and rotations since the
+        start [T, 6]."""
         readings, _ = self.play(faults)
         times = [float(reading.object_time[0]) for reading in readings]
-        return np.array(times), np.stack([reading.object_pos[0] for reading in readings])
+        pos = np.stack([reading.object_pos[0] for reading in readings])
+        turn = turn_of(np.stack([reading.object_quat[0] for reading in readings]))
+        turn *= turn_of(toy_grasp.brick_pose()[1]).inv()
+        return np.array(times), np.column_stack((pos, turn.as_rotvec()))
 
     def test_without_faults_nothing_differs(self):
         for plain, faulty in zip(self.play()[0], self.play(Faults())[0], strict=True):
@@ -76,32 +83,48 @@ class FaultyDriverTest(TestCase):
         time, pos = self.poses(Faults(pose_delay=0.1))
         assert_allclose(now[8:] - time[8:], 0.1, atol=step)
         self.assertLess(np.abs(pos - true[0]).max() - 1e-6, np.abs(true - true[0]).max())
+        time, _ = self.poses(Faults(pose_delay=0.2, drawn_delays=True))  # draws 0.178 s
+        self.assertLess((now - time)[14:].max(), 0.19)
         time, _ = self.poses(Faults(tracker_interval=0.05))
         assert_allclose(time, np.floor(np.arange(STEPS) / 3) * 3 * step, atol=1e-9)
         time, _ = self.poses(Faults(lost_frames=Faults.LOSS_PERIOD))
         assert_array_equal(time, 0)
-        _, pos = self.poses(Faults(position_bias=0.01, angle_bias=0.1))
-        bias = (pos - true)[:5]
-        self.assertGreater(np.abs(bias).max(), 1e-4)
-        assert_allclose(bias, np.broadcast_to(bias[0], bias.shape), atol=1e-6)
-        _, pos = self.poses(Faults(position_noise=0.01))
-        noise = (pos - true)[:5]
-        self.assertLessEqual(np.abs(noise).max(), 0.01 + 1e-6)
-        self.assertGreater(np.ptp(noise, axis=0).max(), 1e-4)
+        with patch.object(Faults, "LOSS_PERIOD", 0.25):
+            time, _ = self.poses(Faults(lost_frames=0.1))
+        self.assertAlmostEqual((time < now - 1e-9).sum(), 12, delta=2)
+        time, _ = self.poses(Faults(pose_delay=0.1, pose_jitter=0.1))
+        self.assertLess((now - time).max(), 0.2 + 1.1 * step)
+        self.assertLess(np.diff(time).min(), 0, "one pose overtakes another")
+        for kind, own in (("position", slice(3)), ("angle", slice(3, 6))):
+            bias, noise = (
+                (self.poses(Faults(**{f"{kind}_{name}": 0.01}))[1] - true)[:5]
+                for name in ("bias", "noise")
+            )
+            self.assertGreater(np.abs(bias[:, own]).min(axis=0).max(), 1e-4)
+            assert_allclose(bias, np.broadcast_to(bias[0], bias.shape), atol=1e-5)
+            self.assertLessEqual(np.abs(noise).max(), 0.01 + 1e-5)
+            self.assertGreater(np.ptp(noise[:, own], axis=0).max(), 1e-4)
         _, pos = self.poses(Faults(object_push=1.0))
         self.assertGreater(np.abs(pos - true).max(), 1e-3)
+        force = max(float(call.args[0].norm()) for call in self.wrench.call_args_list)
+        self.assertAlmostEqual(force * step, toy_grasp.brick().mass, places=5)
 
-        is_arm = np.array([joint.group == "arm" for joint in self.trial.robot.joints])
+        joints = self.trial.robot.joints
+        is_arm = np.array([joint.group == "arm" for joint in joints])
         _, expected = self.play(Faults())
-        _, targets = self.play(Faults(arm_delay=2 * step, hand_delay=4.5 * step))
-        assert_array_equal(targets[2:, is_arm], expected[:-2, is_arm])
+        _, targets = self.play(Faults(arm_delay=1.5 * step, hand_delay=4.5 * step))
+        late = np.concatenate((expected[:1], expected[:-1]))
+        assert_array_equal(targets[:, is_arm], late[:, is_arm])
         assert_array_equal(targets[5:, ~is_arm], expected[:-5, ~is_arm])
         _, targets = self.play(Faults(missed_deadlines=0.5))
         lifts = np.diff(expected[:, is_arm].sum(axis=1))[15:] > 1e-6
         kept = np.diff(targets[:, is_arm].sum(axis=1))[15:] == 0
         self.assertTrue(0 < (kept & lifts).sum() < lifts.sum())
-        _, targets = self.play(Faults(arm_push=1.0))
-        self.assertTrue((targets[:, is_arm] != expected[:, is_arm]).any())
+        half, whole = (self.play(Faults(arm_push=share))[1] - expected for share in (0.5, 1.0))
+        reach = [joint.drive.effort / joint.drive.kp * (joint.group == "arm") for joint in joints]
+        self.assertTrue((np.abs(whole) <= np.array(reach) + 1e-6).all())
+        self.assertGreater(np.abs(whole).max(), 1e-3)
+        assert_allclose(half, whole / 2, atol=1e-6)
 
     def test_a_seed_decides_everything(self):
         faults = Faults(

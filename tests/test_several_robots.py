@@ -32,7 +32,9 @@ from xreset.learning.run import checkpoints, latest_checkpoint, read_run
 from xreset.learning.train import config_of_student
 from xreset.live.engine import GraphPolicy
 from xreset.objects.catalogue import load_objects
+from xreset.policy.onnx_policy import check_contract, policy_contract
 from xreset.runtime import Controller
+from xreset.task.config import TaskConfig
 from xreset.task.slots import Slots, check_fits, needed_slots
 
 try:
@@ -93,6 +95,13 @@ class SlotsTest(TestCase):
         self.assertFalse(found[:, slots.mask == 0].any())
         tips = slots.tips(torch.ones(1, 4 * 3))
         self.assertEqual(tips.tolist(), [[1.0] * 12 + [0.0] * 3])
+
+    def test_a_policy_of_other_slots_is_refused(self):
+        """Although both have 32 actions."""
+        tasks = [TaskConfig(joint_slots=slots) for slots in ((7, 5), (12, 4))]
+        contract = policy_contract(self.allegro, tasks[0], ())
+        with self.assertRaisesRegex(PolicyError, r"mapping .joint_slots: \(7, 5\), here \(12, 4\)"):
+            check_contract("it", contract, self.allegro, tasks[1])
 
     def test_robots_that_do_not_fit(self):
         with self.assertRaisesRegex(RobotError, "6 joints in its arm and up to 5 .* 7 and 1"):

@@ -100,8 +100,7 @@ class FaultyDriver(EngineDriver):
             delay_share = np.ones_like(delay_share)
         pose_share, arm_share, hand_share = delay_share.swapaxes(0, 1)
         self._interval = max(1, round(faults.tracker_interval / self._dt))
-        pose_delay = faults.pose_delay * pose_share + faults.pose_jitter * drawn(steps)
-        self._pose_delay = np.maximum(0.0, pose_delay)
+        self._pose_delay = faults.pose_delay * pose_share + faults.pose_jitter * drawn(steps)
         """[N, C] s"""
         bias = np.repeat((faults.position_bias, faults.angle_bias), 3)
         noise = np.repeat((faults.position_noise, faults.angle_noise), 3)

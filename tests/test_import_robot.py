@@ -26,6 +26,7 @@ from xreset.geometry.collision import table_clearance
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.shapes import surface_of, transform, transformed
 from xreset.geometry.urdf import load_urdf
+from xreset.geometry.urdf_writer import pose
 from xreset.robot_tools import check as checks
 from xreset.robot_tools import homes
 from xreset.robot_tools.check import check
@@ -276,6 +277,19 @@ class Toy(Robots):
         palm, knuckle = np.linalg.inv(hand) @ others
         self.assertAlmostEqual(palm[1, 0], 0.0, delta=0.01)
         assert_allclose(knuckle[:3, 3], (0.085, 0.03, 0), atol=1e-6)
+
+    def test_the_axes_of_the_root_do_not_turn_the_palm(self):
+        urdf = load_robot("ur7e-robotiq").urdf
+        tree = completed(load_urdf(urdf), urdf, [])
+        palms = []
+        for T in (np.eye(4), pose(rpy=(0.3, 0.4, 0.5))):
+            joints = []
+            for joint in tree.joints:
+                if joint.parent == "wrist_3_link":
+                    joints.append(replace(joint, T_parent_joint=T @ joint.T_parent_joint))
+            hand = Hand(tree.with_joints(joints), self.folder, None, [])
+            palms.append(np.linalg.inv(T) @ hand.palm_in_hand)
+        assert_allclose(*palms, atol=1e-9)
 
     def test_check_warns_of_a_turned_palm_and_of_placeholders_for_inertias(self):
         folder = self.imported(HAND)

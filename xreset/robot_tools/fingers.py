@@ -519,10 +519,14 @@ class Hand:
         joints = (*tree.joints, fixed(parent, name, T))
         self.tree = replace(tree, links=(*tree.links, frame(name)), joints=joints)
 
-    def _in_link(self, link: str, point: np.ndarray) -> np.ndarray:
-        """[3] a point of the hand root's frame, in a link's."""
+    def _in_link(self, link: str, points: np.ndarray) -> np.ndarray:
+        """[..., 3] points of the hand root's frame, in a link's."""
         pose = self._at[link]
-        return pose[:3, :3].T @ (point - pose[:3, 3])
+        return (points - pose[:3, 3]) @ pose[:3, :3]
+
+    def _middle(self, link: str, points: np.ndarray) -> np.ndarray:
+        """[3] the middle of the box around points [V, 3] along the axes of a link."""
+        return transformed(bounding_ball(self._in_link(link, points))[0], self._at[link])
 
     def _surface(self, links: Iterable[str]) -> np.ndarray:
         """[V, 3] vertices of the shapes of links in the hand root's frame."""
@@ -549,11 +553,12 @@ class Hand:
                 f"the last link of a finger, {last!r}, has no collision shape, so it can touch nothing. If it is no "
                 f"finger, make {finger.joints[-1]!r} fixed."
             )
-        middle = bounding_ball(cloud)[0]
+        middle = self._middle(last, cloud)
         away = middle - self._on_axis(last, cloud)
         away /= max(np.linalg.norm(away), 1e-9)
         along = (cloud - middle) @ away
-        end = bounding_ball(cloud[along > along.max() - _END])[0]  # jaws may taper to one side
+        # jaws may taper to one side
+        end = self._middle(last, cloud[along > along.max() - _END])
         return np.array([*points, end + away * (along.max() - (end - middle) @ away)])
 
     def _on_axis(self, link: str, cloud: np.ndarray) -> np.ndarray:
@@ -563,7 +568,7 @@ class Hand:
         if not len(cloud):
             return origin
         axis = self._at[link][:3, :3] @ self.tree.above[link].axis
-        return origin + axis * ((bounding_ball(cloud)[0] - origin) @ axis)
+        return origin + axis * ((self._middle(link, cloud) - origin) @ axis)
 
 
 def _bases_and_ends(fingers: Sequence[Finger]) -> tuple[np.ndarray, np.ndarray]:

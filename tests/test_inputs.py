@@ -109,6 +109,8 @@ class InputsTest(InOneFolder):
             write_retargeted(file, motion, config={"meshes": wrong}, inputs=inputs)
             with refuses(self, "--meshes", XResetError, wrong):
                 load_inputs(file)
+        write_retargeted(file, motion, inputs={f"object {SOUP}": 3})
+        self.assertEqual(load_inputs(file, objects=[block]).made_from, {})
 
     def test_the_folder_of_a_robot_is_found_from_any_working_directory(self):
         folder = self.folder / "work"

@@ -437,9 +437,11 @@ def read_meta(path: str | Path) -> dict[str, Any]:
 
 
 def stated_inputs(path: str | Path) -> dict[str, str]:
-    """Return the inputs that a file was made from, name -> SHA-256; empty if it does not state them."""
+    """Return the inputs that a file was made from, name -> SHA-256; without those that it does not state as text."""
     inputs = read_meta(path).get("inputs")
-    return inputs if isinstance(inputs, dict) else {}
+    if not isinstance(inputs, dict):
+        return {}
+    return {name: text for name, text in inputs.items() if isinstance(text, str)}
 
 
 def stated_doubts(path: str | Path) -> list[str]:

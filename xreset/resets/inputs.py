@@ -54,7 +54,7 @@ class Inputs:
 
     data: Data
     objects: tuple[ObjectSpec, ...]
-    """Sorted by name; for a bank in the bank's order."""
+    """Sorted by name; for a bank in the bank's order. Where some are named, in the order of their names."""
     path: Path | None = None
     """File of the data; None: the data never were in a file."""
     hash: str | None = None

@@ -83,6 +83,7 @@ class MadeTest(InOneFolder):
             (GoalError, "is not a pose", {"poses": [(0.5, 0.3, 0.2)]}),
             (GoalError, "Unknown family 'turn'. Choose from: lift, ", {"families": ["turn"]}),
             (GoalError, "Unknown family 'turn'. Choose from: lift, ", {"families": "turn"}),
+            (GoalError, "No family is named", {"families": []}),
         ):
             with (
                 mock.patch("xreset.resets.goals._DRAWS", 2),
@@ -91,6 +92,12 @@ class MadeTest(InOneFolder):
                 make_goals(["banana"], robot=self.robot, **options)
         with self.assertRaisesRegex(ObjectError, "011_banana is given twice"):
             make_goals(["banana", "011_banana"], robot=self.robot)
+
+    def test_a_given_goal_may_be_a_little_inside_the_table(self):
+        low = rest_height(self.banana, np.array([1.0, 0, 0, 0])) - 0.004
+        poses = np.array([[0.6, 0.25, low, 1, 0, 0, 0]])
+        goals = make_goals(["banana"], robot=self.robot, poses=poses)
+        assert_allclose(goals.goal_pos, poses[:, :3], atol=1e-6)
 
     def test_the_command_draws_what_its_options_say(self):
         pose = (0.6, 0.25, 0.3, 1, 0, 0, 0)

@@ -27,6 +27,7 @@ from xreset.errors import FileFormatError, GoalError
 from xreset.files.checks import frozen
 from xreset.files.progress import Progress
 from xreset.files.records import Field, read_record, schema_of, write_record
+from xreset.files.text import texts
 from xreset.geometry.shapes import quat_of, turn_of
 from xreset.objects.rest import rest_height, resting_orientation
 from xreset.resets.bank import (
@@ -109,14 +110,14 @@ def drawn_goals(
     progress: Progress,
 ) -> GoalSet:
     """Return starts and goals of objects; see :func:`xreset.resets.verbs.make_goals`."""
-    if isinstance(families, str):
-        families = (families,)
+    own = [_own_pose(pose) for pose in poses]
     if families is None:
-        families = () if poses else FAMILIES
-    families = tuple(dict.fromkeys(families))
+        families = () if own else FAMILIES
+    families = texts(families)
     if unknown := [family for family in families if family not in FAMILIES]:
         raise GoalError(f"Unknown family {unknown[0]!r}. Choose from: {', '.join(FAMILIES)}.")
-    own = [_own_pose(pose) for pose in poses]
+    if not families and not own:
+        raise GoalError("No family is named. Name one or several of them, or give a pose.")
     for obj in objects:
         for pos, quat in own:
             _check_above_table(obj.name, rest_height(obj, quat) - pos[2])
@@ -381,11 +382,12 @@ def _about_z(angle: float) -> Rotation:
 
 
 def _reached(reach: Reach, drawn: Sequence[_Episode]) -> list[_Episode]:
-    """Return the episodes whose goal is above the table and can be reached."""
+    """Return the episodes whose goal is above the table and can be reached. The heights of given poses have been
+    checked."""
     above = []
     for e in drawn:
         lowest = rest_height(e.obj, quat_of(e.goal_turn)) + e.goal_turn.apply(e.obj.com)[2]
-        if e.goal[2] >= lowest:
+        if e.goal[2] >= lowest or e.family == OWN:
             above.append(e)
     if not above:
         return []

@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 
 from tests.toy_bank import ONLY_FRAMES, SOUP, SPAM, in_this_process, shifted, toy_retargeted
 from xreset import FilterConfig, SqueezeConfig, robots
-from xreset.errors import DemoError, XResetError
+from xreset.errors import BackendUnavailableError, DemoError, XResetError
 from xreset.geometry.kinematics import Kinematics
 from xreset.objects.catalogue import load_objects
 from xreset.objects.rest import rest_height
@@ -167,6 +167,7 @@ class FilterTest(TestCase):
 
         motion = self.retargeted(first_contact=np.array([2, 1]))
         with (
+            mock.patch("xreset.resets.verbs.backend_class"),
             mock.patch("xreset.resets.probe.probe", probe),
             mock.patch("xreset.resets.filter.fingers_of"),
             mock.patch("xreset.resets.filter.grip_forces"),
@@ -219,5 +220,14 @@ class FilterTest(TestCase):
             make_bank(none, self.robot, self.objects, ["mujoco"])
         with self.assertRaisesRegex(DemoError, "objects that were not given"):
             make_bank(self.retargeted(), self.robot, self.objects[:0], ["mujoco"])
+        no_spam = np.arange(6) < 3
+        half = self.retargeted(valid=no_spam, reason=(~no_spam).astype(int))
+        with self.assertRaisesRegex(DemoError, f"were not given: {SPAM}"):
+            make_bank(half, self.robot, self.objects[:1])
         with self.assertRaisesRegex(XResetError, "No engine is named. Name one or several"):
             make_bank(self.retargeted(), self.robot, self.objects, [])  # would accept all states
+        with (
+            mock.patch("xreset.resets.filter.stable_states", side_effect=AssertionError),
+            self.assertRaisesRegex(BackendUnavailableError, "Unknown engine 'bullet'"),
+        ):
+            make_bank(self.retargeted(), self.robot, self.objects, ["mujoco", "bullet"])

@@ -53,14 +53,15 @@ def stable_states(
 
     ``force``: normal force of each finger that presses [N]; 0: none does.
     """
-    owner = retargeted.sequence_of_frame
-    used = objects_named(objects, retargeted.object_name[owner[retargeted.valid]])
+    named = objects_named(objects, retargeted.object_names)
     if not retargeted.valid.any():
         raise DemoError(
             "no frame of the retargeted trajectories is valid, so there is no state to try. "
             "Look at the reasons of xreset retarget."
         )
-    scene = SceneSpec(robot=robot, objects=tuple(used.values()))
+    owner = retargeted.sequence_of_frame
+    used = np.unique(retargeted.object_name[owner[retargeted.valid]])
+    scene = SceneSpec(robot=robot, objects=tuple(named[name] for name in used.tolist()))
     frame, part, poses = closing_states(retargeted, robot, objects, closing)
     sequence = owner[frame]
     post_contact = retargeted.post_contact[frame]

@@ -17,7 +17,7 @@ from xreset.files.checks import Option, OutputFile, PositiveInt, Seed, obeys_rul
 from xreset.files.progress import NamedProgress, Progress, unseen
 from xreset.files.records import replaces
 from xreset.files.text import texts
-from xreset.physics.plugins import Device
+from xreset.physics.plugins import Device, backend_class
 from xreset.resets.config import ClosingConfig, FilterConfig, SqueezeConfig, TransferConfig
 
 if TYPE_CHECKING:
@@ -75,9 +75,9 @@ def make_bank(
         note: called with the doubts that the motion states about its demonstrations.
 
     Raises:
-        DemoError: no frame is valid, or an object of a valid frame is unknown.
+        DemoError: no frame is valid, or an object of the motion is not given.
         FileFormatError: the motion is for a robot with other joints.
-        XResetError: no engine is named, or coal, which retargeting needs too, is not installed.
+        XResetError: no engine is named, one cannot be used here, or coal is not installed.
     """
     from xreset.files.records import stated_doubts
     from xreset.resets.bank import write_bank
@@ -96,6 +96,8 @@ def make_bank(
     engines = texts(engine)
     if not engines:
         raise XResetError("No engine is named. Name one or several of them.")
+    for name in engines:
+        backend_class(name).engine_version()  # one that is missing is refused before others work
     limits = limits or FilterConfig()
     closing = closing or ClosingConfig(spacing=None)
     squeeze = squeeze or SqueezeConfig(force=0.0)

@@ -223,7 +223,7 @@ class DirectionTest(TestCase):
 
     def test_both_ends_are_tried(self):
         for targets in (self.targets, self.targets.reversed()):  # forwards alone: none of the first
-            self.assertGreaterEqual(self.valid(targets).sum(), 8)
+            self.assertGreaterEqual(self.valid(targets, reseeds=0).sum(), 8)
 
     def test_restarts_of_the_first_frame_do_not_copy_the_others(self):
         problem = self.model.problem(self.targets, Thresholds(), ArmSearch(branches=1))

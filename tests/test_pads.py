@@ -14,7 +14,7 @@ from torch.testing import assert_close
 from tests.toy_retarget import FLOAT, box_object, check_gradient, double, hand_targets
 from xreset import robots, synthesize
 from xreset.demos.archive import demo_objects, rest_on_table
-from xreset.geometry.collision import ObjectCollision
+from xreset.geometry.collision import ObjectCollision, object_depth
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import matvec, quat_from_axis_angle, quat_rotate
 from xreset.geometry.surface import Surface
@@ -25,6 +25,7 @@ from xreset.retarget.hand.model import HandModel, HandState
 from xreset.retarget.hand.solve import retarget_hand
 from xreset.retarget.pipeline import HandMotions, RetargetConfig, _push_out
 from xreset.retarget.push import pushed_out
+from xreset.retarget.validity import REASONS, Thresholds
 from xreset.retarget.verbs import retarget_demos
 from xreset.spec import KEYPOINTS
 
@@ -92,13 +93,21 @@ class PadsTest(TestCase):
         check_gradient(self.model, targets, config, state, frames=(1,))
 
     def test_an_object_is_held_between_the_human_s_thumb_and_a_finger(self):
-        demos = synthesize(["soup"], per_object=1, seed=1)
+        demos = synthesize(["spam", "soup"], per_object=1, seed=1)
         objects = list(demo_objects(demos).values())
         config = HandWeights(clearance_weight=0.0, iterations=0)
         hands = HandMotions(demos, self.model.robot, objects, RetargetConfig(hand=config))
         [batch] = hands.batches()
         self.assertFalse(batch.targets.held[0, 0])
         self.assertTrue(batch.targets.held[0, -1])
+        names = [hands.objects[index].name for index in batch.targets.object_index]
+        self.assertEqual(names, demos.object_name.tolist())
+        hands.touching[:] = False
+        touched = (["wrist", "thumb4"], ["wrist", "index4", "little1"], ["thumb1", "little4"])
+        for frame, names in enumerate(touched):
+            hands.touching[frame, [KEYPOINTS.index(name) for name in names]] = True
+        [batch] = hands.batches()
+        self.assertEqual(batch.targets.held[0, :4].tolist(), [False, False, True, False])
 
 
 class PushTest(TestCase):
@@ -123,7 +132,7 @@ class PushTest(TestCase):
         joints, *placed = self.plates((0.0015, 0.004, 0.03))
         collision = ObjectCollision(self.kinematics, [plate])
         found, depth = pushed_out(self.kinematics, collision, joints, *placed, 0.002)
-        assert_close(depth, double([0.0015, 0.001, math.inf]), atol=5e-4, rtol=0)
+        assert_close(depth, double([0.0015, 0.001, math.inf]), atol=1e-4, rtol=0)
         poses = self.kinematics.link_poses(found, collision.links)
         exact = collision.overlaps(poses, *placed).deepest(3)
         assert_close(exact[:2], depth[:2])
@@ -134,9 +143,16 @@ class PushTest(TestCase):
         ways = [self.kinematics.points(q, tips) for q in (joints[1], found[1])]
         way = (ways[1] - ways[0]).norm(dim=-1)
         self.assertTrue((way < 0.005).all(), way)
+        limited = copy.copy(self.kinematics)
+        limited.upper = limited.upper.clone()
+        limited.upper[0] = joints[1, 0] + 0.01
+        self.assertGreater(found[1, 0], limited.upper[0])
+        found, depth = pushed_out(limited, collision, joints, *placed, 0.002)
+        self.assertLessEqual(found[1, 0], limited.upper[0])
+        self.assertLess(depth[1], 0.002)
 
     def test_frames_that_fail_by_depth_alone_are_pushed_out(self):
-        demos = synthesize(["soup"], per_object=1, seed=1)
+        demos = synthesize(["soup"], per_object=2, seed=1)
         objects = list(demo_objects(demos).values())
         config = RetargetConfig(
             hand=HandWeights(object_clearance=-0.004, tolerance=0.1),
@@ -145,12 +161,14 @@ class PushTest(TestCase):
         given = []
 
         def push_out(frames, *others):
-            given.append(copy.deepcopy(frames))
+            given.append((copy.deepcopy(frames), others))
             _push_out(frames, *others)
 
         with patch("xreset.retarget.pipeline._push_out", push_out):
             after = retarget_demos(demos, self.robot, objects, config)
-        (before,) = given
+        before, others = given.pop()
+        self.check_that_pushes_are_judged(before, others)
+        self.check_measures(after, before.root_pos, objects)
         fine = before.reason == 0
         deep = fine & (before.object_depth > 0.002)
         self.assertGreater(deep.sum(), 10)
@@ -164,3 +182,36 @@ class PushTest(TestCase):
         gap = np.linalg.norm(after.fingertip_pos - human, axis=-1).mean(axis=1)
         assert_allclose(after.hand_error[moved], gap[moved], atol=1e-9)
         self.assertTrue((after.hand_error[moved] != before.hand_error[moved]).all())
+
+    def check_measures(self, motion, root_pos, objects):
+        """Errors of the wrist, depths and first contacts are those of the motion."""
+        seen = motion.annotated
+        root = self.kinematics.points(torch.as_tensor(motion.joint_pos), [self.robot.hand_root])
+        off = np.linalg.norm(root[:, 0].numpy() - root_pos, axis=1)
+        assert_allclose(motion.wrist_error, np.where(seen, off, np.inf), atol=1e-9)
+        names = motion.object_name[motion.sequence_of_frame]
+        poses = (motion.joint_pos, motion.object_pos, motion.object_quat_wxyz)
+        depth = object_depth(self.robot, objects, names, *poses)
+        assert_allclose(motion.object_depth[seen], depth[seen], atol=1e-9)
+        for number, first in enumerate(motion.first_contact):
+            self.assertEqual(np.flatnonzero(motion.contact[motion.frames(number)])[0], first)
+
+    def check_that_pushes_are_judged(self, before, others):
+        """A push that moves the wrist too far changes nothing. Jumps count within a sequence alone."""
+
+        def too_far(_kinematics, _collision, joints, *_):
+            return joints + 0.2, torch.zeros(len(joints), dtype=FLOAT)
+
+        frames = copy.deepcopy(before)
+        first = others[0].demos.frame_offsets[:-1]
+        frames.reason[first] = 0
+        fine = frames.reason == 0
+        limits = dataclasses.replace(Thresholds(), arm_jump=0.0)
+        with (
+            patch("xreset.retarget.pipeline.pushed_out", too_far),
+            patch("xreset.retarget.pipeline._THRESHOLDS", limits),
+        ):
+            _push_out(frames, *others)
+        assert_array_equal(frames.joint_pos, before.joint_pos)
+        self.assertEqual(np.flatnonzero(frames.reason == 0).tolist(), first.tolist())
+        self.assertEqual({REASONS[i] for i in frames.reason[fine]}, {"valid", "arm jump"})

@@ -21,6 +21,7 @@ from tests.toy_retarget import (
     double,
     hand_targets,
     retargets_quickly,
+    slope,
 )
 from tests.toy_robot import toy_motion, toy_robot
 from xreset import read_retargeted, robots, write_retargeted
@@ -28,13 +29,20 @@ from xreset.demos.archive import demo_objects, read_demos, rest_on_table, write_
 from xreset.errors import DemoError, FileFormatError, RobotError, XResetError
 from xreset.files.records import arrays_of, stated_doubts, write_npz
 from xreset.geometry.collision import table_clearance
+from xreset.geometry.fields import DistanceFields
 from xreset.geometry.kinematics import Kinematics
-from xreset.geometry.rotations import quat_angle, quat_from_axis_angle, quat_to_matrix
+from xreset.geometry.rotations import (
+    quat_angle,
+    quat_from_axis_angle,
+    quat_multiply,
+    quat_to_matrix,
+)
 from xreset.geometry.surface import Surface
 from xreset.resets.fingers import fingers_of
 from xreset.retarget.arm.config import ArmSearch
-from xreset.retarget.arm.model import ArmModel
-from xreset.retarget.arm.solve import Paths, best_path, track
+from xreset.retarget.arm.model import ArmModel, arm_jump
+from xreset.retarget.arm.solve import Paths, best_path, branches, repaired, track
+from xreset.retarget.arm.solve import system as arm_system
 from xreset.retarget.file import SCHEMA, Retargeted
 from xreset.retarget.hand import solve, terms
 from xreset.retarget.hand.clearance import Objects, contact_distance, too_near
@@ -42,7 +50,7 @@ from xreset.retarget.hand.config import HandWeights
 from xreset.retarget.hand.cost import system
 from xreset.retarget.hand.model import HandModel, keypoint_pairs
 from xreset.retarget.hand.solve import retarget_hand
-from xreset.retarget.least_squares import change_cost, solve_chain
+from xreset.retarget.least_squares import change_cost, free_to_move, solve_chain
 from xreset.retarget.pipeline import RetargetConfig
 from xreset.retarget.validity import REASONS, Measures, Thresholds, classify, too_deep
 from xreset.retarget.verbs import retarget_demos
@@ -67,6 +75,14 @@ class ChainTest(TestCase):
             dense[:, block, block] = diagonal[:, t]
         expected = torch.linalg.solve(dense, rhs.reshape(S, -1)).view(S, T, n)
         assert_close(solve_chain(diagonal, coupling, rhs), expected, atol=1e-10, rtol=0)
+
+
+class BoundsTest(TestCase):
+    def test_variables_stay_at_bounds_that_the_cost_pulls_them_beyond(self):
+        x = double([0.0, 0.0, 1.0, 1.0, 0.5])
+        gradient = double([1.0, -1.0, 1.0, -1.0, 1.0])
+        free = free_to_move(x, gradient, torch.zeros_like(x), torch.ones_like(x))
+        self.assertEqual(free.tolist(), [0, 1, 1, 0, 1])
 
 
 class TermTest(TestCase):
@@ -106,12 +122,12 @@ class HandTest(TestCase):
         """[S, T, P] distance of the keypoints of a motion from others [m]."""
         return (self.model.keypoints(motion) - keypoints).norm(dim=-1)
 
-    def in_frames(self, targets, state):
+    def in_frames(self, targets, state, model=None):
         """Links of the hand and objects in all frames."""
         turn = quat_to_matrix(targets.object_quat.flatten(0, 1))
         index = targets.object_index.repeat_interleave(12)
         objects = Objects(targets.object_pos.flatten(0, 1), turn, index, targets.fields)
-        return self.model.bodies(state.map(lambda x: x.flatten(0, 1))), objects
+        return (model or self.model).bodies(state.map(lambda x: x.flatten(0, 1))), objects
 
     def too_near(self, targets, state, config):
         """What the clearance term acts on."""
@@ -159,6 +175,20 @@ class HandTest(TestCase):
             self.assertGreater((cost - without).max(), 1e-6, term)
         check_gradient(self.model, targets, config, state, frames=(0, 5, 11))
 
+    def test_gradient_where_links_meet_each_other_and_the_table(self):
+        links = tuple(self.model.balls.links)
+        model = HandModel(replace(self.robot, self_collision_links=links))
+        low = self.motion.root_pos * double([1.0, 1.0, 0.0]) + double([0.0, 0.0, 0.03])
+        closed = double([-1.6, 1.6, 0.8, 0.0125]) + 0.05 * self.motion.joints
+        state = replace(self.motion, root_pos=low, joints=closed)
+        config = HandWeights(self_depth=-0.025)
+        targets = self.targets()
+        bodies, objects = self.in_frames(targets, state, model)
+        number = too_near(model, bodies, objects, torch.ones(36) > 0, 0.0, -0.025).number
+        self.assertGreater((number < len(model.balls.radii)).sum(), 10)
+        self.assertGreater((number > 2 * len(model.balls.radii)).sum(), 10)
+        check_gradient(model, targets, config, state, frames=(0, 11))
+
     def test_recovers_a_motion_from_its_own_keypoints(self):
         config = HandWeights(
             smoothness_weight=1e-6, clearance_weight=0.0, iterations=60, tolerance=1e-9
@@ -172,14 +202,18 @@ class HandTest(TestCase):
 
     def test_each_sequence_is_retargeted_independently(self):
         place = self.keypoints[:, :, self.tip] + 0.01
-        targets = self.targets(object_pos=place)
+        small = Surface(box_object(((0, 0, 0), (0.03, 0.03, 0.03)))).field
+        fields = DistanceFields.join([self.far, small])
+        objects = {"fields": fields, "object_index": tensor([0, 1, 0])}
+        targets = self.targets(object_pos=place, **objects)
         together = retarget_hand(self.model, targets).joints
         for order in ([2, 0, 1], [1]):
             assert_close(
                 retarget_hand(self.model, targets[order]).joints, together[order], atol=1e-9, rtol=0
             )
         # a batch pads shorter sequences with frames that are not annotated
-        short = self.targets(keypoints=self.keypoints[[1], :8], object_pos=place[[1], :8])
+        keypoints = self.keypoints[[1], :8]
+        short = self.targets(keypoints=keypoints, object_pos=place[[1], :8], fields=small)
         targets.annotated[1, 8:] = False
         padded = retarget_hand(self.model, targets).joints[1]
         assert_close(padded[:8], retarget_hand(self.model, short).joints[0], atol=1e-9, rtol=0)
@@ -241,6 +275,10 @@ class HandTest(TestCase):
         distance, _ = targets.fields.signed_distance(local, torch.zeros_like(ball))
         expected = distance - balls.radii[ball] - HandWeights().object_clearance
         assert_close(near.value[mine], expected, atol=1e-9, rtol=0)
+        every = torch.arange(len(objects.pos)).repeat_interleave(len(balls.radii))
+        centers = self.model.ball_centers(bodies, every, torch.arange(len(balls.radii)).repeat(36))
+        distance, _ = targets.fields.signed_distance(centers - objects.pos[every], 0 * every)
+        self.assertEqual(len(ball), (distance < balls.radii.repeat(36) + 0.0005).sum())
 
     def test_a_hand_is_filled_once(self):
         with patch("xreset.retarget.hand.model.hand_balls", None):
@@ -307,6 +345,58 @@ class ArmTest(TestCase):
         joints[:, 1, :2] += 0.1
         paths = Paths(joints, targets.annotated.expand(2, 4)[None])
         assert_close(best_path(problem, paths)[0], joints[:, 0], atol=0, rtol=0)
+
+    def test_a_path_without_jumps_may_be_farther_from_home(self):
+        problem = self.model.problem(self.targets(4), Thresholds())
+        joints = self.model.home.repeat(1, 2, 4, 1)
+        joints[:, 0, 2:] += 0.36
+        joints[:, 1] += 0.3
+        best, worth = best_path(problem, Paths(joints, torch.ones(1, 2, 4, dtype=torch.bool)))
+        assert_close(best, joints[:, 1], atol=0, rtol=0)
+        self.assertAlmostEqual(worth.item(), 4 - 6 * 0.3**2)
+
+    def test_gradient_is_the_derivative_of_the_cost(self):
+        """All terms at once: wrist, shapes of arm and hand in the margin above the table, smoothness, a jump."""
+        targets = self.targets(1, shift=(0.01, -0.02, 0.03))
+        turn = quat_from_axis_angle(double([[[0.3, -0.2, 0.5]]]))
+        targets = replace(targets, root_quat=quat_multiply(turn, targets.root_quat))
+        problem = self.model.problem(targets, Thresholds(), ArmSearch(table_margin=0.5))
+        q = self.path(1)[:, 0, self.model.arm]
+        previous = q + double([0.5, -0.1, 0.2, -0.4, 0.0, 0.1])
+
+        def found(joints):
+            return arm_system(problem[:, 0], joints, torch.arange(1), previous)
+
+        for joint, expected in enumerate(found(q).gradient[0]):
+            half = slope(lambda x: found(x).cost, q, (0, joint)) / 2
+            assert_close(half[0], expected, rtol=1e-5, atol=1e-5)
+
+    def test_measures_of_a_path(self):
+        """Shapes of the robot are measured in frames that are valid without them."""
+        joints = self.path(3)[..., self.model.arm]
+        joints[0, 2, -1] = self.model.upper[-1]
+        own = double([[0.0, -0.002, -0.02]])
+        problem = self.model.problem(replace(self.targets(3), hand_clearance=own), Thresholds())
+        of_arm = np.array([-0.01, -0.001])
+        with patch.object(self.model.arm_collision, "clearance", return_value=of_arm) as measured:
+            found = problem.measures(joints)
+        self.assertEqual(len(measured.call_args.args[0]), 2)
+        assert_close(found.self_clearance, double([[-0.01, -0.002, -0.02]]))
+        self.assertEqual(found.at_limit.tolist(), [[False, False, True]])
+
+    def test_no_joint_jumps_after_a_frame_without_a_hand(self):
+        joints = double([[0.0, 9.0], [1.0, 8.5], [3.0, 9.0], [3.0, 8.0]])
+        jump = arm_jump(joints, tensor([True, False, True, True]))
+        self.assertEqual(jump.tolist(), [0.0, 1.0, 0.0, 1.0])
+
+    def test_a_frame_that_is_solved_again_is_followed_both_ways(self):
+        problem = self.model.problem(self.targets(6), Thresholds(), self.CONFIG)
+        one, other = branches(problem).joints[0, :, 0]
+        self.assertGreater((one - other).abs().max(), 0.5, "two solutions of the first frame")
+        wrong = (self.model.home + 1.0).expand(1, 1, 6, -1)
+        known = Paths(wrong, torch.zeros(1, 1, 6, dtype=torch.bool))
+        found = repaired(problem, known, torch.arange(6)[None] == 2)
+        self.assertFalse(problem.reasons(found).any())
 
     def test_lags_behind_a_turn_that_would_be_a_jump(self):
         """The last joint of the arm turns by 0.38 rad in one frame, next to a singularity others do as well."""
@@ -443,8 +533,8 @@ class PipelineTest(InOneFolder):
         tips = [KEYPOINTS.index(tip.keypoint) for tip in self.robot.fingertips]
         human = rest_on_table(self.demos, self.objects).hand_keypoints[:, tips]
         gap = np.linalg.norm(result.fingertip_pos - human, axis=-1).mean(axis=1)
-        # They differ by the wrist's error at most.
-        assert_allclose(gap[seen], result.hand_error[seen], atol=0.011)
+        # they differ by the wrist's error, most often 0.1 mm
+        assert_allclose(gap[seen], result.hand_error[seen], atol=0.001)
 
     def test_the_file_says_how_deep_the_hand_is_and_how_far_from_its_contacts(self):
         result = self.result
@@ -506,6 +596,9 @@ class PipelineTest(InOneFolder):
             ({"reason": self.result.reason + 100}, "points beyond"),
             ({"frame_offsets": self.result.frame_offsets[::-1].copy()}, "frame_offsets"),
             ({"first_contact": np.array([10_000, -1])}, "first_contact"),
+            ({"first_contact": np.array([0, -2])}, "first_contact"),
+            ({"wrist_error": -self.result.wrist_error}, "negative or NaN"),
+            ({"object_depth": np.nan * self.result.object_depth}, "negative or NaN"),
         ):
             path = self.folder / "d.npz"
             damaged = replace(self.result, **changes)

@@ -124,11 +124,15 @@ class HandModel:
             )
         self.keypoint_indices = np.array([KEYPOINTS.index(name) for name in self.keypoint_names])
         """[P] indices into the 21 human keypoints."""
-        tips = {tip.keypoint for tip in robot.fingertips}
+        tips = [tip.keypoint for tip in robot.fingertips]
         self.is_tip = torch.tensor(
             [name in tips for name in self.keypoint_names], device=self.device
         )
         """[P] whether a fingertip follows the keypoint."""
+        if not self.is_tip.any():
+            raise RobotError(
+                f"robot {robot.name!r}: no link follows a fingertip's keypoint. Add {', '.join(tips)} to keypoints."
+            )
         self.pairs = torch.tensor(
             keypoint_pairs(self.keypoint_names, self.keypoint_links), device=self.device
         )

@@ -292,9 +292,11 @@ class HandTest(TestCase):
         self.assertEqual(set(jaws), {(0, 1), (0, 2), (0, 3), (1, 2), (1, 3)})
 
     def test_a_description_that_does_not_allow_retargeting_is_refused(self):
+        no_tips = [spec for spec in self.robot.keypoints if not spec.keypoint.endswith("4")]
         for changes, message in (
             ({"hand_root": "upper"}, "hand_root"),
             ({"keypoints": self.robot.keypoints[:2]}, "3 or more"),
+            ({"keypoints": no_tips}, "fingertip's keypoint. Add thumb4, index4 to"),
         ):
             with self.assertRaisesRegex(RobotError, message):
                 HandModel(replace(self.robot, **changes))

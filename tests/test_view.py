@@ -433,16 +433,6 @@ class OwnPageOnly(WithFiles):
             page._server = mock.Mock(**{"get_host.return_value": host, "get_port.return_value": 80})
             self.assertEqual(page.url, f"http://{expected}:80")
 
-    def test_a_port_that_no_machine_has(self):
-        with (
-            mock.patch("viser.ViserServer") as server,
-            self.assertRaisesRegex(
-                XResetError, "port is 87990, expected a whole number from 0 to 65535"
-            ),
-        ):
-            WebPage("127.0.0.1", 87990, "page")
-        server.assert_not_called()
-
     def test_a_server_that_cannot_be_restricted_is_stopped(self):
         with (
             mock.patch(

@@ -16,7 +16,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from xreset.errors import XResetError, needs
-from xreset.files.checks import Port, obeys_rules
 from xreset.files.text import plain
 from xreset.geometry.kinematics import on_host
 from xreset.geometry.shapes import quat_of
@@ -37,8 +36,7 @@ _ROOM = np.array((0.0, 0.0, 0.3))
 class WebPage:
     """A page at :attr:`url` until :meth:`close`. It shows the table, and answers its own visitors only."""
 
-    @obeys_rules
-    def __init__(self, host: str, port: Port, label: str) -> None:
+    def __init__(self, host: str, port: int, label: str) -> None:
         """Start the server.
 
         Args:
@@ -47,7 +45,7 @@ class WebPage:
             label: title of the page.
 
         Raises:
-            XResetError: viser is not installed, the port is impossible, or the server does not start.
+            XResetError: viser is not installed, or the server does not start.
         """
         with needs("viser, without which --out of xreset view works,", "viewer"):
             import viser

@@ -185,7 +185,7 @@ class FingersTest(TestCase):
         assert_allclose(fingers.point[:, 0, 0], -0.005, atol=1e-3)
 
     def test_a_grip_has_the_force_and_the_weight_of_the_object(self):
-        fingers, _ = self.fingers(0.0201, 0.0501)
+        fingers, _ = self.fingers(0.0201, 0.0261)
         weight = 9.81 * toy_grasp.brick().mass
         forces = grip_forces(fingers, 1.0)
         assert_allclose(forces.sum(dim=1), [2 * (1.0 + weight), 0.0], rtol=1e-3)
@@ -206,21 +206,23 @@ class FingersTest(TestCase):
         assert_allclose(sideways[:2], [0.0201 - shift, -0.0201 - shift], atol=3e-4)
 
     def test_balanced_forces_nearly_cancel(self):
-        """A thumb against four fingers; and a thumb that nothing opposes."""
+        """A thumb against four fingers; a thumb that nothing opposes; two fingers, one of them farther from it."""
         x = torch.tensor([1.0, 0, 0], dtype=torch.float64)
-        inward = torch.stack((x, -x, -x, -x, -x)).expand(2, 5, 3)
+        inward = torch.stack((x, -x, -x, -x, -x)).expand(3, 5, 3)
         height = torch.tensor([0.0, 0.03, 0.01, -0.01, -0.03], dtype=torch.float64)
         lever = -0.04 * inward
         lever[..., 2] = height
-        pressing = torch.ones(2, 5, dtype=torch.bool)
+        pressing = torch.ones(3, 5, dtype=torch.bool)
         pressing[1, 1:] = False
-        factor = _balance(toy_fingers(2, 5, inward=inward, lever=lever), pressing)
+        pressing[2, [2, 4]] = False
+        factor = _balance(toy_fingers(3, 5, inward=inward, lever=lever), pressing)
         thumb = float(factor[0, 0])
         others = factor[0, 1:]
         self.assertAlmostEqual(float(factor[0].mean()), 1.0)
         self.assertAlmostEqual(thumb, float(others.sum()), delta=0.1)
         assert_allclose(others, others.mean().expand(4), atol=1e-6)
         self.assertEqual(factor[1].tolist(), [1, 0, 0, 0, 0])
+        self.assertGreater(factor[2, 3], 2 * factor[2, 1], "no torque remains")
 
     def test_targets_of_a_squeeze_press_with_its_force(self):
         fingers, joints = self.fingers(0.0201, 0.0501)

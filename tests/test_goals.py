@@ -1,23 +1,28 @@
 """Goal sets: starts at rest, goals of each family within reach, and what is refused."""
 
-from unittest import mock
+from unittest import TestCase, mock
 from unittest.mock import patch
 
 import numpy as np
+import torch
 from numpy.testing import assert_allclose, assert_array_equal
+from scipy.spatial.transform import Rotation
 
 from tests.command import succeeds
 from tests.data import InFolder, InOneFolder, refuses
-from tests.toy_bank import SOUP, in_this_process
+from tests.toy_bank import SOUP, in_this_process, shifted
 from tests.toy_goals import toy_goals
 from xreset import load_object, load_policy, load_robot
 from xreset.errors import DemoError, FileFormatError, GoalError, ObjectError
 from xreset.eval.rollout import engine, load_trial, roll_out
+from xreset.files.progress import unseen
 from xreset.files.records import npz_schema
+from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.shapes import turn_of
 from xreset.objects.rest import rest_height
-from xreset.resets.goals import FAMILIES, SCHEMA, read_goals, write_goals
+from xreset.resets.goals import FAMILIES, SCHEMA, drawn_goals, read_goals, write_goals
 from xreset.resets.inputs import load_inputs
+from xreset.resets.reach import Reach
 from xreset.resets.verbs import make_goals
 
 BANANA = "011_banana"
@@ -60,13 +65,43 @@ class MadeTest(InOneFolder):
         assert_allclose(np.abs(turn.as_rotvec()[:4]), expected, atol=1e-5)
 
     def test_offsets_are_those_of_the_published_paper(self):
-        goals = make_goals(["banana"], robot=self.robot, families=["lift"], per_family=8)
+        options = {"robot": self.robot, "families": ["lift"], "per_family": 8}
+        goals = make_goals(["banana"], **options)
         shift = self.centers(goals, "goal") - self.centers(goals, "start") - [0.0, 0.0, 0.2]
         self.assertTrue((np.abs(shift) <= [0.05, 0.05, 0.05]).all(), shift)
         self.assertTrue((np.ptp(shift, axis=0) > 0.01).all(), shift)
         turn = turn_of(goals.goal_quat_wxyz) * turn_of(goals.start_quat_wxyz).inv()
         assert_allclose(turn.as_rotvec()[:, :2], 0.0, atol=1e-5)
         self.assertTrue(10 < np.degrees(turn.magnitude()).max() <= 55)
+        with patch("xreset.resets.goals.START_OFFSET", np.zeros(3)):
+            middle = make_goals(["banana"], **options)
+        moved = self.centers(goals, "start") - self.centers(middle, "start")
+        turn = turn_of(middle.start_quat_wxyz)
+        moved[:, 2] = (turn_of(goals.start_quat_wxyz) * turn.inv()).as_rotvec(degrees=True)[:, 2]
+        most = np.abs(moved).max(axis=0) / [0.02, 0.02, 25.0]
+        self.assertTrue(((most > 0.5) & (most < 1.0001)).all(), most)
+        self.assertEqual(len(np.unique(middle.start_quat_wxyz.round(3), axis=0)), 8, "any turn")
+
+    def test_the_origin_of_a_mesh_may_be_anywhere(self):
+        shift = np.array([0.2, 0.1, -0.3])
+        moved = shifted(self.banana, shift)
+        options = {"per_family": 2, "upright": False, "seed": 0, "progress": unseen}
+        found = drawn_goals([moved], self.robot, "yaw", (), **options)
+        expected = drawn_goals([self.banana], self.robot, "yaw", (), **options)
+        for which in ("start", "goal"):
+            turn = turn_of(getattr(found, f"{which}_quat_wxyz"))
+            place = self.centers(found, which) + turn.apply(shift)
+            assert_allclose(place, self.centers(expected, which), atol=2e-3)
+
+    def test_an_object_that_does_not_come_to_rest_is_refused(self):
+        def falling(*given):
+            return *given[3:], np.zeros(len(given[2]), dtype=bool)
+
+        with (
+            patch("xreset.resets.settle.settled", falling),
+            self.assertRaisesRegex(GoalError, "banana does not come to rest on the table"),
+        ):
+            make_goals(["banana"], robot=self.robot)
 
     def test_impossible_goals_are_refused(self):
         for error, message, options in (
@@ -111,6 +146,33 @@ class MadeTest(InOneFolder):
         assert_allclose(read_goals(file).goal_pos, expected.goal_pos)
         own = np.concatenate((expected.goal_pos[2], expected.goal_quat_wxyz[2]))
         assert_allclose(own, pose, atol=1e-6)
+
+
+class ReachTest(TestCase):
+    def test_grasps_that_are_tried(self):
+        """They hold the object between thumb and fingers, not below 5 cm, and turn with it."""
+        robot = load_robot("ur7e-sharpa")
+        hand = Kinematics(robot, root=robot.hand_root)
+        thumb, *fingers = hand.points(hand.home, [tip.link for tip in robot.fingertips]).numpy()
+        between = (thumb + np.mean(fingers, axis=0)) / 2
+        roots = []
+
+        def reach_poses(_model, root, *_):
+            roots.append(root.numpy())
+            return None, torch.zeros(len(root))
+
+        start = np.array([[0.5, 0.3, 0.02]])
+        goal = np.array([[0.6, 0.2, 0.3]])
+        turn = Rotation.from_rotvec([[0.3, -0.2, 0.5]])
+        with patch("xreset.resets.reach.reach_poses", reach_poses):
+            self.assertTrue(Reach(robot).holds(start, goal, turn).all())
+        at_start, at_goal = roots
+        for root, place in ((at_start, [0.5, 0.3, 0.05]), (at_goal, goal[0])):
+            found = root[:, :3, :3] @ between + root[:, :3, 3]
+            assert_allclose(found, np.tile(place, (15, 1)), atol=1e-9)
+        assert_allclose(at_goal[:, :3, :3], turn.as_matrix() @ at_start[:, :3, :3], atol=1e-9)
+        heights = (at_start[::5, :3, :3] @ between)[:, 2]
+        self.assertTrue(heights[1] < heights[0] < heights[2], "fingers further down, and up")
 
 
 class UsedTest(InFolder):

@@ -53,6 +53,9 @@ class InputsTest(InOneFolder):
         inputs = load_inputs(self.demos_file)
         self.assertEqual([o.name for o in inputs.objects], [SOUP, SPAM])
         self.assertEqual((inputs.path, inputs.hash), (self.demos_file, file_hash(self.demos_file)))
+        trimesh.creation.box((0.06, 0.06, 0.1)).export(self.folder / f"{SOUP}.obj")
+        soup = load_inputs(self.demos_file, only=["soup"], else_meshes=self.folder)
+        self.assertEqual((soup.meshes, len(soup.objects[0].pieces)), (self.folder, 1))
         self.assertIsNone(inputs.robot_name)
         with self.assertRaisesRegex(
             DemoError, r"demos.npz holds human demonstrations.* \(robot=... or --robot\)"

@@ -108,6 +108,9 @@ class PadsTest(TestCase):
             hands.touching[frame, [KEYPOINTS.index(name) for name in names]] = True
         [batch] = hands.batches()
         self.assertEqual(batch.targets.held[0, :4].tolist(), [False, False, True, False])
+        touching = hands.touching[:4, hands.model.keypoint_indices]
+        assert_array_equal(batch.targets.in_contact[0, :4], touching)
+        assert_array_equal(batch.targets.object_pos[0, :4], hands.demos.object_pos[:4])
 
 
 class PushTest(TestCase):

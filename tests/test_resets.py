@@ -35,6 +35,7 @@ class RejectionTest(TestCase):
         above = torch.tensor([[*table.center, 0.3]])
         still = State.at_rest(torch.zeros(1, 2), above, torch.tensor([[1.0, 0, 0, 0]]))
         com = np.array([-0.2, 0, 0])  # from the mesh's origin, which a turn moves
+        objects = [SimpleNamespace(com=9 * com), SimpleNamespace(com=com)]
         turns = {"object_linvel": [0, 0.28, 0], "object_angvel": [0, 0, 1.4]}
         fast = {"object_linvel": [9.0, 0, 0], "joint_vel": [9.0, 0]}
         for expected, velocities, nonfinite, overflow in (
@@ -61,8 +62,8 @@ class RejectionTest(TestCase):
             backend = SimpleNamespace(
                 state=lambda state=state: state,
                 health=lambda health=health: health,
-                scene=SimpleNamespace(table=table, objects=[SimpleNamespace(com=com)]),
-                object_index=torch.tensor([0]),
+                scene=SimpleNamespace(table=table, objects=objects),
+                object_index=torch.tensor([1]),
                 num_worlds=1,
                 device="cpu",
             )

@@ -44,6 +44,7 @@ class SettleTest(TestCase):
         self.assertEqual(at_rest.tolist(), [True, False, True])
         assert_allclose(found[[0, 2], 2], z, atol=2e-3)
         self.assertLess(lean(quats[2]), 1, "it leaned by 6 degrees")
-        with patch("xreset.resets.settle.SECONDS", 0.05):
-            *_, at_rest = settled(self.robot, self.objects, names, pos, quat)
-        self.assertFalse(at_rest[0], "it still falls, slower than a metre a second")
+        for seconds, expected in ((0.05, False), (0.8, True)):
+            with patch("xreset.resets.settle.SECONDS", seconds):
+                *_, at_rest = settled(self.robot, self.objects, names, pos, quat)
+            self.assertEqual(at_rest[0], expected, "it falls for 0.3 s")

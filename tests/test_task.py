@@ -977,6 +977,10 @@ class ResetTest(TestCase):
             plain = self.sample(**config | {"crossed_goals": 0.0})
             assert_close(plain.joint_pos, reset.joint_pos)
             assert_close(plain.object_pos, reset.object_pos)
+        sunk = replace(self.bank, goal_pos=self.bank.start_pos - np.float32([0, 0, 0.01]))
+        reset = self.sample(bank=sunk, demo_probability=0.0, crossed_goals=1.0)
+        start = torch.as_tensor(self.bank.start_pos)[reset.sequence]
+        assert_close(reset.goal_pos[:, 2], start[:, 2])
 
     def test_a_demonstration_without_states_is_drawn_at_home_only(self):
         bank = self.bank.with_states(self.bank.sequence_index != 2)

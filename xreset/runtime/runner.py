@@ -118,10 +118,9 @@ class Runner:
         self.controller = controller
         self.driver = driver
         self.limits = limits or Limits()
-        self._prepare()
 
     def _prepare(self) -> None:
-        """Forget an earlier run: its data are old, and the controller may have begun another episode."""
+        """Begin now, and forget an earlier run: its data are old, and the controller may have begun another episode."""
         count = len(self.controller.target)
         self.outcome = Outcome(reasons=[None] * count, refused=np.zeros(count, dtype=int))
         self._stopped_at = np.full(count, np.inf)
@@ -131,7 +130,7 @@ class Runner:
         """[N] why no newer pose is used."""
         self._sent = self.controller.target
         self._move = np.zeros_like(self._sent)
-        self._begun = -np.inf
+        self._begun = self.driver.now()
 
     def run(self, seconds: float = float("inf")) -> Outcome:
         """Run until the time is over, until every robot has stopped, or until Ctrl-C; then stop the driver.
@@ -139,7 +138,6 @@ class Runner:
         After a fault and after Ctrl-C the targets slow down first.
         """
         self._prepare()
-        self._begun = self.driver.now()
         try:
             self._loop(self._begun + seconds - self.controller.dt / 2)
         except KeyboardInterrupt:

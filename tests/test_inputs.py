@@ -10,7 +10,7 @@ import trimesh
 from numpy.testing import assert_array_equal
 
 from tests.data import InOneFolder, refuses
-from tests.toy_bank import SOUP, SPAM, toy_bank, toy_retargeted
+from tests.toy_bank import ONLY_FRAMES, SOUP, SPAM, toy_bank, toy_retargeted
 from tests.toy_retarget import retargets_quickly
 from xreset import (
     Retargeted,
@@ -93,11 +93,15 @@ class InputsTest(InOneFolder):
         motion = toy_retargeted(self.robot, [SOUP], [0, 2])
         inputs = {f"object {SOUP}": block.source, "object robot": "a toy", "robot": "openarm"}
         file = folder / "motion.npz"
-        write_retargeted(file, motion, config={"meshes": "meshes"}, inputs=inputs)
+        config = {"meshes": "meshes", "doubts": ["odd"]}
+        write_retargeted(file, motion, config=config, inputs=inputs)
         self.assertEqual(object_sources(inputs)["robot"], "a toy")
         found = load_inputs(file)
         self.assertEqual(found.made_from, inputs)
         self.assertEqual((found.meshes, found.objects[0].source), (folder / "meshes", block.source))
+        noted = []
+        make_bank(file, out=folder / "bank.npz", note=noted.append, **ONLY_FRAMES)
+        self.assertEqual((load_inputs(folder / "bank.npz").meshes, noted), (found.meshes, ["odd"]))
         other = folder / "other"
         other.mkdir()
         trained = replace(load_policy("zero", robot=self.robot.name), meshes=other)

@@ -158,7 +158,7 @@ class PushTest(TestCase):
         demos = synthesize(["soup"], per_object=2, seed=1)
         objects = list(demo_objects(demos).values())
         config = RetargetConfig(
-            hand=HandWeights(object_clearance=-0.004, tolerance=0.1),
+            hand=HandWeights(object_clearance=-0.006, tolerance=0.1),
             arm=ArmSearch(restarts=8, branches=1),
         )
         given = []
@@ -177,6 +177,8 @@ class PushTest(TestCase):
         self.assertGreater(deep.sum(), 10)
         self.assertGreater(after.valid[deep].sum(), 0.8 * deep.sum())
         self.assertTrue(after.valid[fine & ~deep].all())
+        left = {REASONS[i] for i in after.reason[deep & ~after.valid]}
+        self.assertEqual(left, {"object collision"})
         moved = (after.joint_pos != before.joint_pos).any(axis=1)
         assert_array_equal(moved, deep & after.valid)
         self.assertLessEqual(after.object_depth[after.valid].max(), 0.002)

@@ -164,14 +164,14 @@ class FilterTest(TestCase):
             return np.array(verdicts[len(tries) - 1])
 
         def pressed(robot, fingers, joint_pos, force):
-            return joint_pos + 0.25
+            return joint_pos + force / 80
 
         motion = self.retargeted(first_contact=np.array([2, 1]))
         with (
             mock.patch("xreset.resets.verbs.backend_class"),
             mock.patch("xreset.resets.probe.probe", probe),
             mock.patch("xreset.resets.filter.fingers_of"),
-            mock.patch("xreset.resets.filter.grip_forces"),
+            mock.patch("xreset.resets.filter.grip_forces", lambda fingers, force: force),
             mock.patch("xreset.resets.filter.squeeze_targets", pressed),
         ):
             return make_bank(motion, self.robot, self.objects, **ONLY_FRAMES | options), tries
@@ -182,7 +182,7 @@ class FilterTest(TestCase):
         bank, tries = self.tried(
             [[-1] * 5, [-1, 0, 0], [2, 2], [-1, 1]],
             limits=FilterConfig(steps=3),
-            squeeze=SqueezeConfig(force=1.0),
+            squeeze=SqueezeConfig(),
         )
         self.assertEqual({steps for _, _, steps in tries}, {3})
         (names, plain, _), *pressing = tries

@@ -115,8 +115,8 @@ class MadeTest(InOneFolder):
                 r"cannot reach 1 of 1 goals .* own_000",
                 {"poses": [(1.9, 0.3, 0.3, 1, 0, 0, 0)]},
             ),
-            (GoalError, "is not a pose", {"poses": [(0.5, 0.3, 0.2)]}),
-            (GoalError, "Unknown family 'turn'. Choose from: lift, ", {"families": ["turn"]}),
+            (GoalError, r"pose \(0.5, 0.3, 0.2\) is not a pose", {"poses": [(0.5, 0.3, 0.2)]}),
+            (GoalError, "pose 0.5 is not a pose", {"poses": (0.5, 0.3, 0.2, 1, 0, 0, 0)}),
             (GoalError, "Unknown family 'turn'. Choose from: lift, ", {"families": "turn"}),
             (GoalError, "No family is named", {"families": []}),
         ):

@@ -27,7 +27,7 @@ from xreset.errors import FileFormatError, GoalError
 from xreset.files.checks import frozen
 from xreset.files.progress import Progress
 from xreset.files.records import Field, read_record, schema_of, write_record
-from xreset.files.text import texts
+from xreset.files.text import shown, texts
 from xreset.geometry.shapes import quat_of, turn_of
 from xreset.objects.rest import rest_height, resting_orientation
 from xreset.resets.bank import (
@@ -274,7 +274,7 @@ def _own_pose(pose: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
     length = np.linalg.norm(values[3:]) if values.shape == (7,) else 0.0
     if not np.isfinite(values).all() or not length > 0:
         raise GoalError(
-            f"The pose {tuple(pose)} is not a pose; expected x, y, z [m] and a quaternion w, x, y, z."
+            f"The pose {shown(pose)} is not a pose; expected x, y, z [m] and a quaternion w, x, y, z."
         )
     return values[:3], values[3:] / length
 

@@ -109,7 +109,6 @@ class HandTest(TestCase):
         cls.motion = toy_motion(cls.model, torch.Generator().manual_seed(1), margin=0.1, turn=0.3)
         cls.keypoints = cls.model.keypoints(cls.motion)
         cls.tip = cls.model.keypoint_names.index("index4")
-        cls.touching = torch.ones(cls.keypoints.shape[:3], dtype=torch.bool)
         cls.far = Surface(box_object(((0, 0, 0), (0.1, 0.1, 0.1)))).field
 
     def targets(self, **changes):
@@ -159,7 +158,7 @@ class HandTest(TestCase):
         turn = quat_from_axis_angle(double([0.3, -0.2, 0.5]))
         targets = self.targets(
             contact_points=self.keypoints + double([0.011, 0.0, 0.0]) * torch.arange(6)[:, None],
-            in_contact=self.touching,
+            in_contact=torch.ones(self.keypoints.shape[:3], dtype=torch.bool),
             object_pos=self.keypoints[:, :, 3] + 0.01,
             object_quat=turn.expand(*self.keypoints.shape[:2], 4),
         )
@@ -219,17 +218,6 @@ class HandTest(TestCase):
         assert_close(padded[:8], retarget_hand(self.model, short).joints[0], atol=1e-9, rtol=0)
         assert_close(padded[8:], padded[7].expand(4, -1))
 
-    def test_joints_do_not_jump(self):
-        """Keypoints that jump to another posture in one frame: the wall spreads the change over several."""
-        swapped = self.keypoints.clone()
-        swapped[:, 6:] = self.keypoints[:, -1:]
-        free, walled = (
-            self.solve(HandWeights(jump_weight=w), keypoints=swapped).joints.diff(dim=1).abs().max()
-            for w in (0.0, 1000.0)
-        )
-        self.assertGreater(free, 0.25)
-        self.assertLess(walled, 0.2)
-
     def test_frames_without_annotation_do_not_matter_and_are_bridged(self):
         annotated = torch.ones(3, 12, dtype=torch.bool)
         annotated[:, 4:7] = False
@@ -242,14 +230,6 @@ class HandTest(TestCase):
         )
         assert_close(joints[:, 5], (joints[:, 3] + joints[:, 7]) / 2, atol=1e-3, rtol=0)
         assert_close(joints[:, 11], joints[:, 9], atol=1e-3, rtol=0)
-
-    def test_contact_pulls_the_links_that_touch(self):
-        aim = self.keypoints.clone()
-        aim[:, :, self.tip, 2] += 0.04
-        mask = torch.zeros_like(self.touching)
-        mask[:, :, self.tip] = True
-        pulled = self.solve(HandWeights(contact_weight=50.0), contact_points=aim, in_contact=mask)
-        self.assertLess(self.off(pulled, aim)[:, :, self.tip].mean(), 0.025)
 
     def test_the_hand_stays_out_of_the_object(self):
         inside = self.targets(object_pos=self.keypoints[:, :, self.tip])

@@ -146,8 +146,8 @@ class Data(WithFiles):
         data = toy_retargeted(self.robot)
         data.joint_pos[1, 2] += 50.0  # in a frame that is not valid, and so is not used
         load_view(self.write(data, "beyond"))
-        data.joint_pos[6, 2] += 50.0
-        words = "beyond.npz holds joint3 = 50.08 in frame 6, but the joint goes from -1.571 to 1.571. Make"
+        data.joint_pos[6, 2] = 1.575
+        words = "beyond.npz holds joint3 = 1.575 in frame 6, but the joint goes from -1.571 to 1.571. Make"
         with self.assertRaisesRegex(FileFormatError, words):
             load_view(self.write(data, "beyond"))
 

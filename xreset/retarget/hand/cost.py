@@ -99,7 +99,7 @@ def _frame_costs(
     found = found + Quadratic.of_residuals(value / scale, slope / scale) * config.clearance_weight
 
     if config.pad_weight and len(model.pad_balls):
-        held = (targets.held & targets.annotated).flatten().nonzero()[:, 0]
+        held = targets.held.flatten().nonzero()[:, 0]
         value, slope = pad_distances(model, bodies, objects, held)
         value = (value - config.object_clearance) / scale
         slope = slope / scale

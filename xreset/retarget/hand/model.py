@@ -45,7 +45,7 @@ class HandTargets(Tensors):
     in_contact: Tensor
     """[S, T, P] bool"""
     held: Tensor
-    """[S, T] bool: the human's thumb and another finger touch the object."""
+    """[S, T] bool: the human's thumb and another finger touch the object; False where not annotated."""
     object_pos: Tensor
     """[S, T, 3] origin of the object's mesh frame [m]."""
     object_quat: Tensor

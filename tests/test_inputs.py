@@ -56,6 +56,8 @@ class InputsTest(InOneFolder):
         trimesh.creation.box((0.06, 0.06, 0.1)).export(self.folder / f"{SOUP}.obj")
         soup = load_inputs(self.demos_file, only=["soup"], else_meshes=self.folder)
         self.assertEqual((soup.meshes, len(soup.objects[0].pieces)), (self.folder, 1))
+        given = load_inputs(self.demos, objects=[load_object(SPAM), soup.objects[0]])
+        self.assertIs(given.objects[0], soup.objects[0])
         self.assertIsNone(inputs.robot_name)
         with self.assertRaisesRegex(
             DemoError, r"demos.npz holds human demonstrations.* \(robot=... or --robot\)"

@@ -11,7 +11,7 @@ from torch import Tensor
 
 
 def quat_multiply(a: Tensor, b: Tensor) -> Tensor:
-    """[..., 4] Hamilton product: rotation b first, then a; both broadcast."""
+    """[..., 4] Hamilton product: rotation b first, then a; both broadcast, with equally many dimensions."""
     aw, u = a.split((1, 3), dim=-1)
     bw, v = b.split((1, 3), dim=-1)
     pw, products = (a * b).split((1, 3), dim=-1)

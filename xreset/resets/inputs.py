@@ -34,7 +34,7 @@ from xreset.resets.goals import GoalSet, checked_goals, read_goals
 from xreset.retarget.file import SCHEMA as MOTION
 from xreset.retarget.file import Retargeted, check_retargeted, object_sources, read_retargeted
 from xreset.retarget.verbs import retarget_demos
-from xreset.spec import ObjectSpec, RobotSpec, check_robot, checked_objects
+from xreset.spec import ObjectSpec, RobotSpec, check_robot, checked_objects, objects_named
 
 Kind = Literal["demos", "motion", "bank", "goals"]
 Data = Demos | Retargeted | ResetBank
@@ -130,7 +130,7 @@ def load_inputs(
     Args:
         source: file of ``xreset demos``, ``xreset retarget``, ``xreset resets`` or ``xreset goals``, or its content.
         robot: the robot, its name or its folder; default: the robot that the file names. Demonstrations name none.
-        objects: the objects of robot motion, if they are loaded already.
+        objects: the objects, if they are loaded already.
         meshes: folder of object meshes; default: the folder that the file states.
         else_meshes: folder of meshes where the file states none; default: the built-in stand-ins.
         only: names of the objects to load; demonstrations of other objects are left out. Default: all objects.
@@ -165,7 +165,7 @@ def load_inputs(
         if isinstance(data, Demos):
             data = data.select(objects=names)
     if isinstance(data, Demos):
-        by_name = demo_objects(data, folder)
+        by_name = demo_objects(data, folder) if objects is None else objects_named(objects, names)
         loaded = tuple(by_name[name] for name in names)
     else:
         stated = object_sources(made_from)

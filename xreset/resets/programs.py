@@ -50,7 +50,8 @@ def palm_path(
         turn_length: length that makes turns of the palm comparable to shifts [m].
 
     Returns:
-        [T, N, J] joints, and [N, 6] what is missing to the last pose: shift [m] and rotation vector [rad].
+        [T, N, J] joints, and [N, 6] what is missing to the last pose before the last step: shift [m] and rotation
+        vector [rad].
     """
     robot = kinematics.robot
     arm = torch.as_tensor(robot.arm_indices)

@@ -61,10 +61,9 @@ class FaultyDriverTest(TestCase):
         """Return the ages [T] of the poses that are read with faults, and their positions and rotations since the
         start [T, 6]."""
         readings, _ = self.play(Faults(**faults))
-        time, pos, quat = (
-            np.concatenate([getattr(reading, f"object_{name}") for reading in readings])
-            for name in ("time", "pos", "quat")
-        )
+        time = np.concatenate([reading.object_time for reading in readings])
+        pos = np.concatenate([reading.object_pos for reading in readings])
+        quat = np.concatenate([reading.object_quat for reading in readings])
         turn = turn_of(quat) * turn_of(toy_grasp.brick_pose()[1]).inv()
         return np.arange(STEPS) * STEP - time, np.column_stack((pos, turn.as_rotvec()))
 

@@ -59,11 +59,9 @@ def stable_states(
             "no frame of the retargeted trajectories is valid, so there is no state to try. "
             "Look at the reasons of xreset retarget."
         )
-    owner = retargeted.sequence_of_frame
-    used = np.unique(retargeted.object_name[owner[retargeted.valid]])
-    scene = SceneSpec(robot=robot, objects=tuple(named[name] for name in used.tolist()))
+    scene = SceneSpec(robot=robot, objects=tuple(named.values()))
     frame, part, poses = closing_states(retargeted, robot, objects, closing)
-    sequence = owner[frame]
+    sequence = retargeted.sequence_of_frame[frame]
     post_contact = retargeted.post_contact[frame]
     object_name = retargeted.object_name[sequence]
     states = State.at_rest(*map(torch.as_tensor, poses))

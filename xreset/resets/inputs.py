@@ -175,13 +175,13 @@ def load_inputs(
             robot = robot_of_file(path, stated_robot(path) or data.robot, data.robot)
         robot = robot or data.robot
         if objects is None:
-            # before meshes are cut, which takes minutes
             sources = {name: object_source(name, folder) for name in names if name in stated}
-            check_sources(str(path or "the data"), stated, sources)
-            loaded = load_objects(names, folder)
         else:
-            loaded = checked_objects(load_robot(robot), objects)
-            check_sources(str(path or "the data"), stated, {o.name: o.source for o in loaded})
+            objects = checked_objects(load_robot(robot), objects)
+            sources = {o.name: o.source for o in objects}
+        # before meshes are cut, which takes minutes
+        check_sources(str(path or "the data"), stated, sources)
+        loaded = load_objects(names, folder) if objects is None else objects
     robot_name = None
     spec = None
     if robot is not None:

@@ -19,6 +19,7 @@ from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import matvec, quat_from_axis_angle, quat_rotate
 from xreset.geometry.surface import Surface
 from xreset.retarget.arm.config import ArmSearch
+from xreset.retarget.arm.model import ArmModel
 from xreset.retarget.hand.config import HandWeights
 from xreset.retarget.hand.cost import system
 from xreset.retarget.hand.model import HandModel, HandState
@@ -202,7 +203,8 @@ class PushTest(TestCase):
             self.assertEqual(np.flatnonzero(motion.contact[motion.frames(number)])[0], first)
 
     def check_that_pushes_are_judged(self, before, others):
-        """A push that moves the wrist too far changes nothing. Jumps count within a sequence alone."""
+        """A push changes nothing if it moves the wrist too far, or the hand meets itself. Jumps count within a sequence
+        alone."""
 
         def too_far(_kinematics, _collision, joints, *_):
             return joints + 0.2, torch.zeros(len(joints), dtype=FLOAT)
@@ -220,3 +222,7 @@ class PushTest(TestCase):
         assert_array_equal(frames.joint_pos, before.joint_pos)
         self.assertEqual(np.flatnonzero(frames.reason == 0).tolist(), first.tolist())
         self.assertEqual({REASONS[i] for i in frames.reason[fine]}, {"valid", "arm jump"})
+        with patch.object(ArmModel, "hand_clearance", lambda _, joints: joints[..., 0] - 9.0):
+            frames = copy.deepcopy(before)
+            _push_out(frames, *others)
+        assert_array_equal(frames.joint_pos, before.joint_pos)

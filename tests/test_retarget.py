@@ -218,6 +218,11 @@ class HandTest(TestCase):
         assert_close(padded[:8], retarget_hand(self.model, short).joints[0], atol=1e-9, rtol=0)
         assert_close(padded[8:], padded[7].expand(4, -1))
 
+    def test_the_motion_turns_with_the_scene(self):
+        turn = quat_to_matrix(quat_from_axis_angle(double([0.0, 0.0, 0.7])))
+        joints = self.solve(keypoints=self.keypoints @ turn.mT).joints
+        assert_close(joints, self.solve().joints, atol=1e-9, rtol=0)
+
     def test_frames_without_annotation_do_not_matter_and_are_bridged(self):
         annotated = torch.ones(3, 12, dtype=torch.bool)
         annotated[:, 4:7] = False

@@ -83,7 +83,7 @@ class MadeTest(InOneFolder):
         self.assertEqual(len(np.unique(middle.start_quat_wxyz.round(3), axis=0)), 8, "any turn")
 
     def test_the_origin_of_a_mesh_may_be_anywhere(self):
-        shift = np.array([0.2, 0.1, -0.3])
+        shift = np.array([2.0, 1.0, -3.0])
         moved = shifted(self.banana, shift)
         options = {"per_family": 2, "upright": False, "seed": 0, "progress": unseen}
         found = drawn_goals([moved], self.robot, "yaw", (), **options)

@@ -310,9 +310,11 @@ def _resting_poses(
         first_alike = (ups @ ups.T > _SAME_POSE).argmax(axis=1)
         poses, which = np.unique(first_alike, return_inverse=True)
         rows[obj.name] = len(names) + which
-        for quat in quat_of(turns)[poses]:
+        for turn in turns[poses]:
+            quat = quat_of(turn)
             names.append(obj.name)
-            starts.append((*_MIDDLE, rest_height(obj, quat)))
+            # the mesh's origin may be far from the object
+            starts.append((*(_MIDDLE - turn.apply(obj.com)[:2]), rest_height(obj, quat)))
             quats.append(quat)
     from xreset.resets.settle import settled
 

@@ -310,11 +310,11 @@ def _resting_poses(
         first_alike = (ups @ ups.T > _SAME_POSE).argmax(axis=1)
         poses, which = np.unique(first_alike, return_inverse=True)
         rows[obj.name] = len(names) + which
-        for turn in turns[poses]:
-            quat = quat_of(turn)
+        for quat in quat_of(turns)[poses]:
             names.append(obj.name)
             # the mesh's origin may be far from the object
-            starts.append((*(_MIDDLE - turn.apply(obj.com)[:2]), rest_height(obj, quat)))
+            middle = _MIDDLE - turn_of(quat).apply(obj.com)[:2]
+            starts.append((*middle, rest_height(obj, quat)))
             quats.append(quat)
     from xreset.resets.settle import settled
 

@@ -96,8 +96,9 @@ def make_bank(
     engines = texts(engine)
     if not engines:
         raise XResetError("No engine is named. Name one or several of them.")
+    # fails where an engine is missing, before others have worked
     for name in engines:
-        backend_class(name).engine_version()  # one that is missing is refused before others work
+        backend_class(name).engine_version()
     limits = limits or FilterConfig()
     closing = closing or ClosingConfig(spacing=None)
     squeeze = squeeze or SqueezeConfig(force=0.0)

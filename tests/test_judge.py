@@ -5,17 +5,21 @@ from unittest.mock import patch
 
 import numpy as np
 import torch
+from numpy.testing import assert_allclose
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from tests import toy_grasp
 from tests.command import refused, succeeds
 from tests.data import InFolder
 from tests.toy_bank import shifted
 from tests.toy_grasp import OPEN, brick, robot
+from tests.toy_robot import toy_robot
 from xreset import SqueezeConfig, load_robot, write_bank
 from xreset.errors import DemoError, RobotError
 from xreset.geometry.kinematics import Kinematics
-from xreset.geometry.shapes import turn_of
+from xreset.geometry.shapes import quat_of, turn_of
+from xreset.resets.programs import palm_path
 from xreset.robot_tools import judge as judging
 from xreset.robot_tools.verbs import judge
 
@@ -90,6 +94,28 @@ class Judge(InFolder):
                 self.assertAlmostEqual(
                     torch.atan2(relative[2, 1], relative[2, 2]), turn, delta=0.03
                 )
+
+    def test_joints_of_a_path_are_the_best_compromise_and_what_is_missing_is_told(self):
+        """The toy's arm has three joints, too few for this pose."""
+        kinematics = Kinematics(toy_robot())
+        home = kinematics.home[None]
+        palm = kinematics.link_poses(home, ["palm"])[0, 0].numpy()
+        pos = palm[:3, 3] + [0.02, -0.03, 0.01]
+        turn = Rotation.from_rotvec([0.1, 0.05, -0.1]) * Rotation.from_matrix(palm[:3, :3])
+        goal = (torch.as_tensor(pos)[None, None], torch.as_tensor(quat_of(turn))[None, None])
+        for iterations, length in ((1, 0.3), (200, 0.05), (200, 1.0)):
+            path, missing = palm_path(
+                kinematics, home, *goal, iterations=iterations, turn_length=length
+            )
+            end = kinematics.jacobian(path[-1], ["palm"])
+            left = (turn * Rotation.from_matrix(end.rot[0, 0].numpy()).inv()).as_rotvec()
+            assert_allclose(missing[0], [*(pos - end.pos[0, 0].numpy()), *left], atol=1e-9)
+            # no joint of the arm can lower the squared error
+            slope = (
+                missing[:, :3] @ end.linear[0, 0] + length**2 * missing[:, 3:] @ end.angular[0, 0]
+            )
+            if iterations > 1:
+                self.assertLess(slope[0, kinematics.robot.arm_indices].abs().max(), 1e-6)
 
     def test_a_bank_without_grasps_in_the_air_is_refused(self):
         low = replace(

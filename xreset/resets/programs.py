@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from xreset.geometry.dynamics import drive_values
-from xreset.geometry.kinematics import Kinematics
+from xreset.geometry.kinematics import Kinematics, PointJacobian
 from xreset.geometry.rotations import (
     matrix_to_quat,
     quat_conjugate,
@@ -50,27 +50,32 @@ def palm_path(
         turn_length: length that makes turns of the palm comparable to shifts [m].
 
     Returns:
-        [T, N, J] joints, and [N, 6] what is missing to the last pose before the last step: shift [m] and rotation
-        vector [rad].
+        [T, N, J] joints, and [N, 6] what is missing to the last pose at its joints: shift [m] and rotation vector
+        [rad].
     """
     robot = kinematics.robot
     arm = torch.as_tensor(robot.arm_indices)
     scale = joint_pos.new_tensor([1.0] * 3 + [turn_length] * 3)
     q = joint_pos
     path = []
-    missing = joint_pos.new_zeros(len(joint_pos), 6)
     for goal_pos, goal_quat in zip(pos, quat, strict=True):
         for _ in range(iterations):
             palm = kinematics.jacobian(q, [robot.palm])
-            away = quat_multiply(goal_quat, quat_conjugate(matrix_to_quat(palm.rot[:, 0])))
-            turn = quat_to_axis_angle(quat_normalize(away))
-            missing = torch.cat((goal_pos - palm.pos[:, 0], turn), dim=-1)
+            missing = _missing(palm, goal_pos, goal_quat)
             jacobian = torch.cat((palm.linear[:, 0], palm.angular[:, 0]), dim=-2)[..., arm]
             step = least_squares(scale[:, None] * jacobian, scale * missing, _DAMPING)
             q = q.index_add(-1, arm, step.clamp(-_LARGEST_STEP, _LARGEST_STEP))
             q = kinematics.clamp(q)
         path.append(q)
-    return torch.stack(path), missing
+    palm = kinematics.jacobian(q, [robot.palm])
+    return torch.stack(path), _missing(palm, pos[-1], quat[-1])
+
+
+def _missing(palm: PointJacobian, pos: Tensor, quat: Tensor) -> Tensor:
+    """[N, 6] shift [m] and rotation vector [rad] from the palm to poses [N, 3], [N, 4]."""
+    away = quat_multiply(quat, quat_conjugate(matrix_to_quat(palm.rot[:, 0])))
+    turn = quat_to_axis_angle(quat_normalize(away))
+    return torch.cat((pos - palm.pos[:, 0], turn), dim=-1)
 
 
 def least_squares(jacobian: Tensor, step: Tensor, damping: float) -> Tensor:

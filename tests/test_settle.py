@@ -9,9 +9,12 @@ from scipy.spatial.transform import Rotation
 
 from tests.toy_bank import SOUP, SPAM, in_this_process
 from xreset import load_object, load_robot
+from xreset.backends.conformance.scene import ball
 from xreset.geometry.shapes import quat_of, turn_of
 from xreset.resets.probe import probe
 from xreset.resets.settle import settled
+
+UPRIGHT = np.array([[1.0, 0, 0, 0]])
 
 
 def tilted(degrees):
@@ -48,3 +51,15 @@ class SettleTest(TestCase):
             with patch("xreset.resets.settle.SECONDS", seconds):
                 *_, at_rest = settled(self.robot, self.objects, names, pos, quat)
             self.assertEqual(at_rest[0], expected, "it falls for 0.3 s")
+
+    def test_an_object_that_rolls_on_is_at_rest_where_it_is(self):
+        def rolling(engine, scene, names, states, *judge, **options):
+            states.object_linvel[:, 0] = 0.05
+            states.object_angvel[:, 1] = 0.05 / 0.03
+            return probe(engine, scene, names, states, *judge, **options)
+
+        start = np.array([[0.4, 0.3, 0.03]])
+        with patch("xreset.resets.settle.probe", rolling):
+            pos, _, at_rest = settled(self.robot, [ball()], ["ball"], start, UPRIGHT)
+        self.assertTrue(at_rest.all())
+        assert_allclose(pos, [[0.55, 0.3, 0.03]], atol=0.02)

@@ -325,7 +325,7 @@ def _resting_poses(
         resting = tried[at_rest[tried]]
         if not len(resting):
             raise GoalError(
-                f"{obj.name} does not come to rest on the table: it rolls or falls over in MuJoCo. Leave it"
+                f"{obj.name} does not come to rest on the table: it rolls off it or falls over in MuJoCo. Leave it"
                 " out, or make a side of its mesh flat."
             )
         turns = turn_of(quat[resting])

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from xreset.files.progress import Progress, unseen
+from xreset.geometry.rotations import quat_angle
 from xreset.physics import Backend, State
 from xreset.physics.plugins import device_for, make_backend
 from xreset.resets.config import FilterConfig
@@ -129,6 +130,16 @@ def of_center(backend: Backend, state: State) -> State:
     may be anywhere."""
     coms = torch.as_tensor(np.stack([obj.com for obj in backend.scene.objects]))
     return at_point(state, coms.to(state.object_pos)[backend.object_index])
+
+
+def stays(backend: Backend, start: State, *, moved: float, turned: float) -> Tensor:
+    """[N] bool: whether a world's object is where it was at the start, its center of mass within ``moved`` [m] and its
+    orientation within ``turned`` [rad]; False if the engine has failed."""
+    state = of_center(backend, backend.state())
+    shift = state.object_pos - of_center(backend, start).object_pos
+    angle = quat_angle(state.object_quat, start.object_quat)
+    health = backend.health()
+    return (shift.norm(dim=-1) < moved) & (angle < turned) & ~health.nonfinite & ~health.overflow
 
 
 def rejection(backend: Backend, start: State, limits: FilterConfig) -> Tensor:

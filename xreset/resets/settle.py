@@ -10,14 +10,17 @@ from torch import Tensor
 
 from xreset.files.progress import unseen
 from xreset.physics import Backend, State
-from xreset.resets.config import FilterConfig
-from xreset.resets.probe import probe, rejection
+from xreset.resets.probe import probe, stays
 from xreset.spec import ObjectSpec, RobotSpec, SceneSpec
 
 SECONDS = 3.0
 """Time that an object is given to come to rest [s]."""
-AT_REST = FilterConfig(linear_velocity=0.01, angular_velocity=0.1)
-"""Speeds of an object at rest."""
+_WATCHED = 0.5
+"""Time after a stop for which an object at rest stays where it is [s]."""
+_MOVED = 0.005
+"""Farthest that its center of mass may move in this time [m]."""
+_TURNED = float(np.radians(3.0))
+"""Farthest that it may turn in this time [rad]."""
 
 
 def settled(
@@ -28,7 +31,8 @@ def settled(
     quat: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the poses to which objects come in MuJoCo from poses [S, 3], [S, 4], and whether they are at rest on the
-    table there [S]. The robot holds its home configuration meanwhile, in which it touches no object."""
+    table there [S]. An object that still rolls is at rest if it stays where it is after a stop: so do episodes begin.
+    The robot holds its home configuration meanwhile, in which it touches no object."""
     scene = SceneSpec(robot=robot, objects=tuple(objects))
     home = torch.as_tensor(robot.home).expand(len(pos), -1)
     found = probe(
@@ -47,7 +51,10 @@ def settled(
 
 
 def _rest_pose(backend: Backend, start: State) -> Tensor:
-    """Return the objects' poses and whether they are at rest on the table: [N, 3 + 4 + 1]."""
-    state = backend.state()
-    at_rest = rejection(backend, start, AT_REST) < 0
-    return torch.cat((state.object_pos, state.object_quat, at_rest[:, None]), dim=-1)
+    """Return the objects' poses, and whether they stay there after a stop: [N, 3 + 4 + 1]."""
+    state = backend.state().clone()
+    still = State.at_rest(start.joint_pos, state.object_pos, state.object_quat)
+    backend.set_state(still)
+    backend.step(round(_WATCHED / backend.scene.control_dt) * backend.scene.substeps)
+    at_rest = stays(backend, still, moved=_MOVED, turned=_TURNED)
+    return torch.cat((still.object_pos, still.object_quat, at_rest[:, None]), dim=-1)

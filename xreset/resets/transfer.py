@@ -21,13 +21,13 @@ from torch import Tensor
 from xreset.files.processes import batches
 from xreset.files.progress import Progress
 from xreset.geometry.collision import object_depth
-from xreset.geometry.rotations import matrix_to_quat, quat_angle
+from xreset.geometry.rotations import matrix_to_quat
 from xreset.geometry.shapes import turn_of
 from xreset.physics import Backend, State
 from xreset.resets.bank import ResetBank
 from xreset.resets.config import TransferConfig
 from xreset.resets.grasps import carried
-from xreset.resets.probe import of_center, rejections
+from xreset.resets.probe import rejections, stays
 from xreset.retarget.arm.config import QUICK
 from xreset.retarget.arm.model import ArmModel, ArmTargets
 from xreset.retarget.arm.solve import track_each
@@ -276,12 +276,7 @@ def _depth(scene: SceneSpec, object_name: np.ndarray, states: State) -> np.ndarr
 
 def _lost(backend: Backend, start: State) -> Tensor:
     """[N] -1 where the object of a world is where it was at the start, else 0."""
-    state = of_center(backend, backend.state())
-    health = backend.health()
-    moved = (state.object_pos - of_center(backend, start).object_pos).norm(dim=-1)
-    turned = quat_angle(state.object_quat, start.object_quat)
-    held = (moved < _MOVED) & (turned < _TURNED) & ~health.nonfinite & ~health.overflow
-    return torch.where(held, -1, 0)
+    return torch.where(stays(backend, start, moved=_MOVED, turned=_TURNED), -1, 0)
 
 
 def _first_of_each(rows: np.ndarray, group: np.ndarray, count: int) -> np.ndarray:

@@ -9,7 +9,7 @@ import torch
 from numpy.testing import assert_allclose
 
 from tests.toy_bank import ONLY_FRAMES, SOUP, SPAM, in_this_process, shifted, toy_retargeted
-from xreset import FilterConfig, SqueezeConfig, robots
+from xreset import FilterConfig, SqueezeConfig, robots, synthesize
 from xreset.errors import BackendUnavailableError, DemoError, XResetError
 from xreset.geometry.kinematics import Kinematics
 from xreset.objects.catalogue import load_objects
@@ -225,6 +225,8 @@ class FilterTest(TestCase):
         half = self.retargeted(valid=no_spam, reason=(~no_spam).astype(int))
         with self.assertRaisesRegex(DemoError, f"were not given: {SPAM}"):
             make_bank(half, self.robot, self.objects[:1])
+        with self.assertRaisesRegex(XResetError, "retargeted is Demos.*expected the motion of"):
+            make_bank(synthesize(["soup"], 1), self.robot)
         with self.assertRaisesRegex(XResetError, "No engine is named. Name one or several"):
             make_bank(self.retargeted(), self.robot, self.objects, [])  # would accept all states
         with (

@@ -16,7 +16,7 @@ from xreset.errors import XResetError
 from xreset.files.checks import Option, OutputFile, PositiveInt, Seed, obeys_rules
 from xreset.files.progress import NamedProgress, Progress, unseen
 from xreset.files.records import replaces
-from xreset.files.text import texts
+from xreset.files.text import shown, texts
 from xreset.physics.plugins import Device, backend_class
 from xreset.resets.config import ClosingConfig, FilterConfig, SqueezeConfig, TransferConfig
 
@@ -55,7 +55,7 @@ def make_bank(
     A state in which the robot is more than 2 mm deep in the object is rejected without a test.
 
     Args:
-        retargeted: motion made by xreset retarget.
+        retargeted: motion made by xreset retarget; demonstrations are refused.
         robot: name or folder of the robot; default: that of the motion.
         objects: the objects of the motion; default: those of ``meshes``.
         engine: physics engine to test the states in, or several: states are kept that are stable in all of them. A
@@ -77,14 +77,19 @@ def make_bank(
     Raises:
         DemoError: no frame is valid, or an object of the motion is not given.
         FileFormatError: the motion is for a robot with other joints.
-        XResetError: no engine is named, one cannot be used here, or coal is not installed.
+        XResetError: no motion is given, no engine is named, one cannot be used here, or coal is not installed.
     """
     from xreset.files.records import stated_doubts
     from xreset.resets.bank import write_bank
     from xreset.resets.filter import stable_states
     from xreset.resets.inputs import load_inputs
     from xreset.resets.transfer import add_transfers
+    from xreset.retarget.file import Retargeted
 
+    if not isinstance(retargeted, str | Path | Retargeted):
+        raise XResetError(
+            f"retargeted is {shown(retargeted)}, expected the motion of xreset.retarget_demos, or its file."
+        )
     inputs = load_inputs(
         retargeted, robot=robot, objects=objects, meshes=meshes, accept=("motion",)
     )

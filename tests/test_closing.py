@@ -64,14 +64,16 @@ def toy_fingers(states, links, **changes):
 
 
 class ClosingTest(TestCase):
-    """Two demonstrations of five frames in which the first finger moves by 12 mm a frame and the second by 4."""
+    """Two demonstrations of five frames in which the first finger moves by 12 mm a frame and the second by 4. The brick
+    turns about its center of mass, which is 0.5 m from the origin of its mesh."""
 
     def setUp(self):
         joints = ROBOT.home + 0.01 * np.random.default_rng(0).normal(size=(10, len(ROBOT.joints)))
         tips = np.arange(10)[:, None, None] * [[0.012, 0, 0], [0, 0.004, 0]]
         turned = quat_of(Rotation.from_rotvec(0.2 * np.arange(10)[:, None] * [0, 0, 1]))
         changes = {"joint_pos": joints, "fingertip_pos": tips, "object_quat_wxyz": turned}
-        changes["object_pos"] = np.repeat([[0.5, 0.3, 0.1], [0.6, 0.2, 0.1]], 5, axis=0)
+        places = np.repeat([[0.5, 0.3, 0.1], [0.6, 0.2, 0.1]], 5, axis=0)
+        changes["object_pos"] = places - turn_of(turned).apply([0.5, 0, 0])
         self.data = toy_retargeted(ROBOT, ["brick", "brick"], [0, 5, 10], **changes)
         self.gap = np.full((10, 2), 0.03)
 
@@ -79,9 +81,9 @@ class ClosingTest(TestCase):
         fingers = toy_fingers(10, 2, gap=torch.as_tensor(self.gap))
         config = ClosingConfig(**({"spacing": 0.005} | config))
         brick = toy_grasp.brick()
-        centered = shifted(brick, -brick.com)
+        moved = shifted(brick, [0.5, 0, 0] - brick.com)
         with patch("xreset.resets.closing.fingers_of", lambda *_: fingers):
-            return closing_states(data or self.data, ROBOT, (centered,), config)[:2]
+            return closing_states(data or self.data, ROBOT, (moved,), config)[:2]
 
     def bridged(self, data=None, **config):
         """Frames that states between follow."""

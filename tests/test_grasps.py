@@ -12,6 +12,7 @@ from xreset import robots
 from xreset.geometry.surface import prepared_surface
 from xreset.resets.grasps import losses, planned_grasps
 from xreset.retarget.hand.model import HandModel
+from xreset.retarget.validity import REASONS
 
 UPRIGHT = np.array([1.0, 0, 0, 0])
 ABOVE = np.array([0.45, 0.30, 0.0])
@@ -41,21 +42,42 @@ class GraspsTest(TestCase):
         thumb, finger = tips.unbind(1)
         across = torch.nn.functional.normalize(finger - thumb, dim=-1)
         self.assertGreater(float(across[:, 0].abs().min()), np.cos(np.radians(25.0)))
-        width = (finger - thumb).norm(dim=-1)
-        # points in the flat sides of a box: a line aslant is longer
-        self.assertTrue(((width > 0.05) & (width < 0.058)).all())
+        # the points are in the flat sides of a box: a line aslant is longer
+        line = 0.05 / across[:, 0].abs()
+        gap = (finger - thumb).norm(dim=-1) - line
+        self.assertTrue(((gap > 0.0009) & (gap < 0.0014)).all(), "0.5 mm on each side")
+        opened = self.hand.kinematics.points(grasps.opened, ["thumb_tip", "index_tip"])
+        self.assertGreater((opened[:, 1] - opened[:, 0]).norm(dim=-1).min(), 0.08)
+        most = grasps.retreat[:, 1:].abs().amax(dim=0)
+        self.assertTrue((most > 0.95).all(), "from any side")
 
-    def test_the_hand_is_clear_of_the_object_open_and_closed(self):
-        grasps = self.grasps
-        surface = prepared_surface(self.block)
-        for joints in (grasps.joints, grasps.opened):
-            poses = grasps.root[:, None] @ self.hand.kinematics.link_poses(
-                joints, self.hand.balls.links
-            )
-            own = poses[:, self.hand.balls.link]
-            centers = (own[..., :3, :3] @ self.hand.balls.centers[..., None])[..., 0]
-            centers = (centers + own[..., :3, 3]).numpy()
-            depth = self.hand.balls.radii.numpy() - surface.signed_distance(centers)
+    def test_the_ends_of_the_fingers_may_hold_an_object(self):
+        """A rod of 5 cm, between its ends."""
+        with patch("xreset.resets.grasps._DEPTHS", (1.0,)):
+            grasps = planned_grasps(self.hand, block(0.05, 0.006, 0.006))
+        far = (grasps.joints - grasps.opened).abs()[:, 0]
+        grasps = grasps[far < far.min() + 0.05]
+        balls = self.hand.balls
+        pads = self.hand.pad_balls
+        own = (grasps.joints, [balls.links[link] for link in balls.link[pads]], balls.centers[pads])
+        centers = self.hand.kinematics.points(*own, base=grasps.root)
+        beyond = (centers * -grasps.retreat[:, None]).sum(-1) + balls.radii[pads]
+        self.assertLess(beyond.amax(dim=1).abs().max(), 0.003)
+
+    def test_the_hand_is_clear_of_the_object_closed_and_open_on_its_way(self):
+        """Two walls next to a block leave room for closed fingers."""
+        walls = [((x, 0, 0), (0.01, 0.1, 0.1)) for x in (-0.054, 0.054)]
+        walled = box_object(((0, 0, 0), (0.05, 0.1, 0.1)), *walls)
+        grasps = planned_grasps(self.hand, walled)
+        surface = prepared_surface(walled)
+        balls = self.hand.balls
+        links = [balls.links[link] for link in balls.link]
+        opened = [(grasps.opened, distance) for distance in (0.0, 0.03, 0.08)]
+        for joints, distance in ((grasps.joints, 0.0), *opened):
+            root = grasps.root.clone()
+            root[:, :3, 3] += distance * grasps.retreat
+            centers = self.hand.kinematics.points(joints, links, balls.centers, base=root)
+            depth = balls.radii.numpy() - surface.signed_distance(centers.numpy())
             self.assertLess(depth.max(), 0.0021)
 
     def test_an_object_wider_than_the_jaw_opens_has_no_grasp(self):
@@ -91,3 +113,31 @@ class GraspsTest(TestCase):
         # a jaw would have to come from the side, with a finger in the table
         self.assertEqual(self.reasons(plate, low, low + 0.1), ["no approach"])
         self.assertEqual(self.reasons(block(0.1, 0.1, 0.1), lift, lift), ["too wide"])
+
+    def test_the_most_frequent_reason_counts_and_every_grasp_is_tried(self):
+        """Sixty grasps, 24 at a time. The arm does not carry them to the goal, 3 m above the start."""
+        start = ABOVE + np.array([0, 0, 1.0])
+        for reasons, expected in (
+            (["table collision", "joint limit", "table collision"] * 20, "table at the goal"),
+            (["joint limit", "wrist position", "wrist position"] * 20, "goal out of reach"),
+            (["joint limit"] * 60, "joint limit"),
+            (["self collision"] * 60, "collision at the goal"),
+            (["self collision"] * 59 + ["valid"], ""),
+        ):
+            left = [REASONS.index(reason) for reason in reasons]
+
+            def reach_poses(_arm, root, joints, *_, left=left):
+                count = len(root)
+                if root[0, 2, 3] < 2.0:
+                    return None, torch.zeros(count, dtype=torch.long)
+                self.assertTrue(torch.isin(joints, self.grasps.joints).all(), "not opened")
+                found = torch.tensor(left[:count])
+                del left[:count]
+                return None, found
+
+            with (
+                patch("xreset.resets.grasps.planned_grasps", lambda *_: self.grasps),
+                patch("xreset.resets.grasps.reach_poses", reach_poses),
+            ):
+                found = self.reasons(self.block, start, start + np.array([0, 0, 3.0]))
+            self.assertEqual((found, left), ([expected], []))

@@ -31,6 +31,7 @@ from xreset.physics import Health, State
 from xreset.pictures.view.load import load_view
 from xreset.resets.bank import starts_and_goals
 from xreset.resets.distribution import ResetDistribution
+from xreset.resets.grasps import grasps_of_bank, losses
 from xreset.resets.transfer import _lost, add_transfers
 from xreset.retarget.file import read_retargeted
 from xreset.robot_tools.verbs import judge
@@ -236,10 +237,24 @@ class TransferTest(TestCase):
         self.assertFalse(none.transferred.any())
 
     def test_hardly_more_grasps_are_tried_than_a_pose_lacks(self):
+        """The jaws of each grasp are a little deeper in the brick, which tells the grasps apart."""
         data = motion(first=(0.0, 0.03, 0.04, 0.05, 0.06, 0.07, 0.08))
-        found, calls = tried(bank(data, (PRESSING,) * 7), data, per_pose=3)
+        data.joint_pos[:7, JAW] -= 2e-4 + 1e-4 * np.arange(7)
+        base = bank(data, (PRESSING,) * 7)
+        found, calls = tried(base, data, per_pose=3)
         self.assertEqual([len(names) for _, _, names, *_ in calls], [15])  # 18 candidates
         self.assertEqual(found.frame_index[7:].tolist(), [1] * 3 + [2] * 3 + [3] * 3)
+        none, last, each = [False] * 3, [False, False, True], [True] * 3
+        progress = Mock()
+        rounds = [[*none, *last, *each], [False, True, True]]
+        found, calls = tried(base, data, verdicts=rounds, per_pose=1, progress=progress)
+        self.assertEqual(len(calls), 2, "only the first pose lacks a state after the first round")
+        self.assertEqual(found.frame_index[7:].tolist(), [1, 2, 3])
+        first, second = (states.joint_pos for *_, states, _ in calls)
+        assert_array_equal(found.joint_pos[7:], torch.stack((second[1], first[5], first[6])))
+        assert_allclose(found.object_depth[7:], 0.022 - 1.1 * found.joint_pos[7:, JAW], atol=1e-6)
+        done = [call.args[0] for call in progress.call_args_list]
+        self.assertEqual(done, sorted(done))
 
     def test_what_the_arm_does_not_reach_is_not_tried(self):
         pos = self.data.object_pos.copy()
@@ -250,6 +265,14 @@ class TransferTest(TestCase):
         pos[3:, 1] += 1
         found, calls = tried(self.bank, replace(self.data, object_pos=pos))
         self.assertEqual((found.num_states, calls), (3, []))
+        column, wrist = Kinematics(ROBOT).points(torch.as_tensor(OTHER[2]), ["column", "wrist"])
+        ahead = torch.nn.functional.normalize((wrist - column)[:2], dim=0).numpy()
+        for off, count in ((0.004, 6), (0.008, 4)):  # the arm reaches no farther
+            pos = self.data.object_pos.copy()
+            pos[5, :2] += off * ahead
+            with patch("xreset.resets.transfer.object_depth", lambda *x: np.zeros(len(x[2]))):
+                _, calls = tried(self.bank, replace(self.data, object_pos=pos))
+            self.assertEqual(len(calls[0][2]), count)
 
     def test_grasps_that_are_deep_in_the_object_are_not_tried(self):
         deep = self.bank.joint_pos.copy()
@@ -294,6 +317,23 @@ class TransferTest(TestCase):
         done, work = zip(*(call.args for call in progress.call_args_list), strict=True)
         self.assertEqual(list(done), sorted(done))
         self.assertEqual((done[-1], set(work)), (12, {12}))
+
+
+class LossesTest(TestCase):
+    def test_a_hand_that_is_no_jaw_has_the_grasps_of_the_bank(self):
+        """The gripper could lift the brick in the second demonstration as in the first, and has no grasp of the can."""
+        data = motion()
+        own = bank(data, FIRMLY)
+        grasps = grasps_of_bank(own, ROBOT, OBJECTS[0])
+        place, _ = brick_in_wrist(
+            *(values[:2] for values in (own.joint_pos, own.object_pos, own.object_quat_wxyz))
+        )
+        assert_allclose(torch.linalg.inv(grasps.root)[:, :3, 3], place, atol=1e-6)
+        found = losses(own, ROBOT, OBJECTS, progress=unseen)
+        self.assertEqual(found.tolist(), ["", "", "no grasp"])
+        transferred = replace(own, transferred=np.ones(3, dtype=bool))
+        found = losses(transferred, ROBOT, OBJECTS, progress=unseen)
+        self.assertEqual(found.tolist(), ["no grasp"] * 3)
 
 
 class HeldTest(TestCase):

@@ -17,9 +17,12 @@ from tests.command import succeeds
 from tests.data import InFolder
 from tests.engine_checks import with_drive
 from tests.toy_bank import in_this_process, shifted, toy_bank, toy_retargeted
+from tests.toy_robot import toy_robot
 from xreset import ClosingConfig, SqueezeConfig, read_bank
+from xreset.backends.conformance.scene import objects
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.shapes import quat_of, turn_of
+from xreset.geometry.surface import prepared_surface
 from xreset.resets.closing import closing_states, positions_between, rotations_between
 from xreset.resets.distribution import bank_starts
 from xreset.resets.fingers import Fingers, _balance, fingers_of, grip_forces, squeeze_targets
@@ -136,6 +139,9 @@ class ClosingTest(TestCase):
     def test_only_until_thumb_and_finger_touch_or_the_object_is_moved(self):
         self.gap[:] = 0.0021
         self.assertEqual(self.bridged(), [0, 1, 2, 3, 5, 6, 7, 8], "near is no touch")
+        self.gap[:, 0] = 0.001
+        self.assertEqual(self.bridged(), [0, 1, 2, 3, 5, 6, 7, 8], "a thumb alone")
+        self.gap[:, 0] = 0.0021
         self.gap[1:, 1] = 0.001  # a finger alone
         self.gap[2, 0] = 0.001
         self.gap[8, 0] = 0.001
@@ -185,6 +191,25 @@ class FingersTest(TestCase):
         assert_close(fingers.inward[:, 1], wrist, atol=0.02, rtol=0)
         # the jaw's inner side
         assert_allclose(fingers.point[:, 0, 0], -0.005, atol=1e-3)
+
+    def test_each_state_has_its_own_object(self):
+        """The toy robot's fingers are balls of 1 cm."""
+        robot = toy_robot()
+        brick, can = objects()[:2]
+        place = np.array([[0.3, 0.2, 0.4], [0.1, 0.1, 0.2]])
+        turn = Rotation.from_rotvec([[0.4, -0.3, 0.2], [0.1, 0.9, 0.0]])
+        joints = np.stack((robot.home, robot.home + 0.3))
+        names = np.array(["can", "brick"])
+        fingers = fingers_of(robot, (brick, can), names, joints, place, quat_of(turn))
+        centers = Kinematics(robot).points(torch.as_tensor(joints), fingers.links)
+        touching = centers + 0.01 * fingers.inward
+        assert_close(fingers.weight, 9.81 * tensor([can.mass, brick.mass], dtype=torch.float64))
+        for state, obj in enumerate((can, brick)):
+            local = turn[state].inv().apply(centers[state].numpy() - place[state])
+            distance = prepared_surface(obj).signed_distance(local)
+            assert_allclose(fingers.gap[state], distance - 0.01, atol=1e-3)
+            lever = touching[state].numpy() - place[state] - turn[state].apply(obj.com)
+            assert_allclose(fingers.lever[state], lever, atol=1e-9)
 
     def test_a_grip_has_the_force_and_the_weight_of_the_object(self):
         fingers, _ = self.fingers(0.0201, 0.0261)

@@ -12,6 +12,7 @@ from tests.command import succeeds
 from tests.data import InFolder, InOneFolder, refuses
 from tests.toy_bank import SOUP, in_this_process, shifted
 from tests.toy_goals import toy_goals
+from tests.toy_robot import toy_robot
 from xreset import load_object, load_policy, load_robot
 from xreset.errors import DemoError, FileFormatError, GoalError, ObjectError
 from xreset.eval.rollout import engine, load_trial, roll_out
@@ -173,6 +174,39 @@ class ReachTest(TestCase):
         assert_allclose(at_goal[:, :3, :3], turn.as_matrix() @ at_start[:, :3, :3], atol=1e-9)
         heights = (at_start[::5, :3, :3] @ between)[:, 2]
         self.assertTrue(heights[1] < heights[0] < heights[2], "fingers further down, and up")
+
+    def test_every_grasp_is_tried_for_every_object(self):
+        """Fifteen grasps, of which the arm reaches none; two at a time for seven objects."""
+        tried = []
+
+        def reach_poses(_model, root, *_):
+            tried.append(root.numpy().reshape(count, -1, 4, 4)[..., :3, :3])
+            return None, torch.ones(len(root))
+
+        with patch("xreset.resets.reach.reach_poses", reach_poses):
+            for count in (1, 7):
+                place = np.full((count, 3), 0.3)
+                held = Reach(load_robot("ur7e-sharpa")).holds(
+                    place, place, Rotation.identity(count)
+                )
+                self.assertFalse(held.any())
+        alone = tried.pop(0)
+        assert_allclose(np.concatenate(tried, axis=1), np.tile(alone, (7, 1, 1, 1)), atol=1e-9)
+
+    def test_how_far_an_arm_stretches(self):
+        """The toy's arm, whose last joint slides by up to 0.3 m, and its hand."""
+        robot = toy_robot()
+        hand = Kinematics(robot, root=robot.hand_root)
+        thumb, finger = hand.points(hand.home, [tip.link for tip in robot.fingertips])
+        center = float((thumb + finger).norm()) / 2
+        links = sum(
+            map(np.linalg.norm, ([0, 0, 0.2], [0.02, 0.05, 0], [0.3, 0, 0.1], [0, 0.1, 0.05]))
+        )
+        stretched = center + links + 0.3 + 0.02
+        places = np.array(robot.base_pos) + np.outer(
+            stretched + np.array([-1e-6, 1e-6]), [0, 0.6, 0.8]
+        )
+        self.assertEqual(Reach(robot).stretches_to(places).tolist(), [True, False])
 
 
 class UsedTest(InFolder):

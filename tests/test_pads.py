@@ -20,17 +20,19 @@ from xreset.geometry.rotations import matvec, quat_from_axis_angle, quat_rotate
 from xreset.geometry.surface import Surface
 from xreset.retarget.arm.config import ArmSearch
 from xreset.retarget.arm.model import ArmModel
+from xreset.retarget.arm.solve import track_each
 from xreset.retarget.hand.config import HandWeights
 from xreset.retarget.hand.cost import system
 from xreset.retarget.hand.model import HandModel, HandState
 from xreset.retarget.hand.solve import retarget_hand
-from xreset.retarget.pipeline import HandMotions, RetargetConfig, _push_out
+from xreset.retarget.pipeline import HandMotions, RetargetConfig
 from xreset.retarget.push import pushed_out
 from xreset.retarget.validity import REASONS, Thresholds
 from xreset.retarget.verbs import retarget_demos
 from xreset.spec import KEYPOINTS
 
 UP = double([0.0, 0.0, 1.0])
+DEEP = REASONS.index("object collision")
 
 
 class PadsTest(TestCase):
@@ -155,31 +157,27 @@ class PushTest(TestCase):
         self.assertLessEqual(found[1, 0], limited.upper[0])
         self.assertLess(depth[1], 0.002)
 
-    def test_frames_that_fail_by_depth_alone_are_pushed_out(self):
-        demos = synthesize(["soup"], per_object=2, seed=1)
-        objects = list(demo_objects(demos).values())
+    def motion(self, demos, objects, push):
+        """The motion that follows demonstrations, with a way of pushing in place of :func:`pushed_out`."""
         config = RetargetConfig(
             hand=HandWeights(object_clearance=-0.006, tolerance=0.1),
             arm=ArmSearch(restarts=8, branches=1),
         )
-        given = []
+        with patch("xreset.retarget.pipeline.pushed_out", push):
+            return retarget_demos(demos, self.robot, objects, config)
 
-        def push_out(frames, *others):
-            given.append((copy.deepcopy(frames), others))
-            _push_out(frames, *others)
-
-        with patch("xreset.retarget.pipeline._push_out", push_out):
-            after = retarget_demos(demos, self.robot, objects, config)
-        before, others = given.pop()
-        self.check_that_pushes_are_judged(before, others)
-        self.check_measures(after, before.root_pos, objects)
-        fine = before.reason == 0
-        deep = fine & (before.object_depth > 0.002)
+    def test_frames_that_fail_by_depth_alone_are_pushed_out(self):
+        demos = synthesize(["soup"], per_object=2, seed=1)
+        objects = list(demo_objects(demos).values())
+        before = self.motion(demos, objects, lambda *x: (x[2], torch.full(x[3].shape, math.inf)))
+        after = self.motion(demos, objects, pushed_out)
+        path = self.check_that_pushes_are_judged(demos, objects, before)
+        self.check_measures(after, path.root_pos, objects)
+        deep = before.reason == DEEP
         self.assertGreater(deep.sum(), 10)
         self.assertGreater(after.valid[deep].sum(), 0.8 * deep.sum())
-        self.assertTrue(after.valid[fine & ~deep].all())
-        left = {REASONS[i] for i in after.reason[deep & ~after.valid]}
-        self.assertEqual(left, {"object collision"})
+        self.assertTrue(after.valid[before.valid].all())
+        self.assertEqual(set(after.reason[deep & ~after.valid].tolist()), {DEEP})
         moved = (after.joint_pos != before.joint_pos).any(axis=1)
         assert_array_equal(moved, deep & after.valid)
         self.assertLessEqual(after.object_depth[after.valid].max(), 0.002)
@@ -190,10 +188,13 @@ class PushTest(TestCase):
         self.assertTrue((after.hand_error[moved] != before.hand_error[moved]).all())
 
     def check_measures(self, motion, root_pos, objects):
-        """Errors of the wrist, depths and first contacts are those of the motion."""
+        """Errors of the wrist, depths and first contacts are those of the motion; targets of the wrist are
+        [S, T, 3]."""
         seen = motion.annotated
         root = self.kinematics.points(torch.as_tensor(motion.joint_pos), [self.robot.hand_root])
-        off = np.linalg.norm(root[:, 0].numpy() - root_pos, axis=1)
+        lengths = np.diff(motion.frame_offsets)
+        targets = np.vstack([own[:count] for own, count in zip(root_pos, lengths, strict=True)])
+        off = np.linalg.norm(root[:, 0].numpy() - targets, axis=1)
         assert_allclose(motion.wrist_error, np.where(seen, off, np.inf), atol=1e-9)
         names = motion.object_name[motion.sequence_of_frame]
         poses = (motion.joint_pos, motion.object_pos, motion.object_quat_wxyz)
@@ -202,27 +203,45 @@ class PushTest(TestCase):
         for number, first in enumerate(motion.first_contact):
             self.assertEqual(np.flatnonzero(motion.contact[motion.frames(number)])[0], first)
 
-    def check_that_pushes_are_judged(self, before, others):
+    def check_that_pushes_are_judged(self, demos, objects, before):
         """A push changes nothing if it moves the wrist too far, or the hand meets itself. Jumps count within a sequence
-        alone."""
+        alone. Return the arm's path."""
+        arm, hand = self.robot.arm_indices[0], self.robot.hand_indices[0]
 
         def too_far(_kinematics, _collision, joints, *_):
-            return joints + 0.2, torch.zeros(len(joints), dtype=FLOAT)
+            joints = joints.clone()
+            joints[::2, arm] += 0.2
+            joints[1::2, hand] = 0.05
+            return joints, torch.zeros(len(joints), dtype=FLOAT)
 
-        frames = copy.deepcopy(before)
-        first = others[0].demos.frame_offsets[:-1]
-        frames.reason[first] = 0
-        fine = frames.reason == 0
-        limits = dataclasses.replace(Thresholds(), arm_jump=0.0)
+        def jump(_kinematics, _collision, joints, *_):
+            joints = joints.clone()
+            joints[:, arm] += 0.5
+            return joints, torch.zeros(len(joints), dtype=FLOAT)
+
+        def clearance(_, joints):
+            return -1e-3 * joints[..., 0] - (joints[..., 0] > 0.045).double()
+
         with (
-            patch("xreset.retarget.pipeline.pushed_out", too_far),
-            patch("xreset.retarget.pipeline._THRESHOLDS", limits),
+            patch("xreset.retarget.pipeline.track_each", wraps=track_each) as tracked,
+            patch.object(ArmModel, "hand_clearance", clearance),
         ):
-            _push_out(frames, *others)
-        assert_array_equal(frames.joint_pos, before.joint_pos)
-        self.assertEqual(np.flatnonzero(frames.reason == 0).tolist(), first.tolist())
-        self.assertEqual({REASONS[i] for i in frames.reason[fine]}, {"valid", "arm jump"})
-        with patch.object(ArmModel, "hand_clearance", lambda _, joints: joints[..., 0] - 9.0):
-            frames = copy.deepcopy(before)
-            _push_out(frames, *others)
-        assert_array_equal(frames.joint_pos, before.joint_pos)
+            refused = self.motion(demos, objects, too_far)
+        assert_array_equal(refused.joint_pos, before.joint_pos)
+        [path] = tracked.call_args.args[1]
+        assert_close(path.hand_clearance, -1e-3 * path.hand_joints[..., 0])
+        limits = dict.fromkeys(
+            ("hand_error", "wrist_position", "wrist_orientation", "table_depth", "self_depth"), 9.0
+        )
+        with patch("xreset.retarget.pipeline._THRESHOLDS", Thresholds(**limits)):
+            after = self.motion(demos, objects, jump)
+        jumps = np.zeros(len(after.joint_pos), dtype=bool)
+        moved = np.abs(np.diff(after.joint_pos[:, self.robot.arm_indices], axis=0))
+        jumps[1:] = (moved.max(axis=1) > 0.35) & after.annotated[:-1]
+        jumps[after.frame_offsets[:-1]] = False
+        reason = REASONS.index("arm jump")
+        fine = np.isin(after.reason, (0, reason))
+        assert_array_equal((after.reason == reason)[fine], jumps[fine])
+        self.assertGreater(jumps[before.valid].sum(), 1)
+        self.assertTrue(fine[after.frame_offsets[:-1]].all())
+        return path

@@ -127,8 +127,10 @@ class Judge(InFolder):
         wide[:, robot().joint_names.index("jaw_a_slide")] = OPEN + 0.03
         with self.assertRaisesRegex(RobotError, "within 10 mm of the object"):
             judge(replace(bank(), joint_pos=wide), robot(), (brick(),))
-        with self.assertRaisesRegex(DemoError, "not given: brick. Given: ."):
-            judge(bank(), robot(), ())
+        names = {"object_names": ("brick", "can"), "object_sources": ("stand-in", "stand-in")}
+        more = replace(bank(), sequence_object=np.array(["brick", "brick", "can"]), **names)
+        with self.assertRaisesRegex(DemoError, "not given: can. Given: brick."):
+            judge(more.with_states(np.arange(4)), robot(), (brick(),))
 
     def test_a_weak_grip_drops_in_the_command(self):
         self.enterContext(toy_grasp.found())

@@ -219,6 +219,7 @@ def _grasps(
     squeeze: SqueezeConfig,
 ) -> tuple[ResetBank, State]:
     """Return the states to try, and how they start: at rest, with targets that press on the object."""
+    objects_named(objects, bank.object_names)
     height = raised(bank, objects)
     lifted = bank.with_states(np.flatnonzero(bank.own_grasp & bank.post_contact & (height > LIFT)))
     if not lifted.num_states:
@@ -226,7 +227,6 @@ def _grasps(
             f"robot {robot.name!r}: the bank has no state in which an object is in the air. Look at the reasons of "
             "xreset resets and xreset retarget."
         )
-    objects_named(objects, lifted.object_name)
     fingers = fingers_of(
         robot,
         objects,

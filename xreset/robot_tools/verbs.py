@@ -197,7 +197,7 @@ def judge(
 
     Raises:
         RobotError: the bank has no lifted grasp of any object.
-        DemoError: a lifted object of the bank is unknown.
+        DemoError: an object of the bank is unknown.
         FileFormatError: the bank's states are for a robot with other joints, or for other meshes.
     """
     from xreset.pictures.render import write_png

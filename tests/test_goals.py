@@ -1,5 +1,6 @@
 """Goal sets: starts at rest, goals of each family within reach, and what is refused."""
 
+from dataclasses import replace
 from unittest import TestCase, mock
 from unittest.mock import patch
 
@@ -10,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.command import succeeds
 from tests.data import InFolder, InOneFolder, refuses
-from tests.toy_bank import SOUP, in_this_process, shifted
+from tests.toy_bank import SOUP, SPAM, in_this_process, shifted, toy_retargeted
 from tests.toy_goals import toy_goals
 from tests.toy_robot import toy_robot
 from xreset import load_object, load_policy, load_robot
@@ -21,7 +22,8 @@ from xreset.files.records import npz_schema
 from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.shapes import turn_of
 from xreset.objects.rest import rest_height
-from xreset.resets.goals import FAMILIES, SCHEMA, drawn_goals, read_goals, write_goals
+from xreset.resets.bank import starts_and_goals
+from xreset.resets.goals import FAMILIES, SCHEMA, drawn_goals, read_goals, with_goals, write_goals
 from xreset.resets.inputs import load_inputs
 from xreset.resets.reach import Reach
 from xreset.resets.verbs import make_goals
@@ -229,6 +231,15 @@ class UsedTest(InFolder):
             )
         with self.assertRaisesRegex(DemoError, "is a goal set, which holds no motion"):
             load_trial(load_policy("ik", robot="ur7e-sharpa"), goals)
+
+    def test_what_a_bank_says_of_its_objects_counts_before_what_goals_say(self):
+        """The bank has the spam alone, which has no friction of its own."""
+        spam = replace(load_object(SPAM), mass=0.5, friction=None)
+        bank = starts_and_goals(toy_retargeted(self.robot, [SPAM], [0, 2]), self.robot, [spam])
+        stated = {"object_mass": np.array([0.3, 0.4]), "object_friction": np.array([0.6, 0.7])}
+        both = with_goals(bank, toy_goals(self.robot, **stated))
+        self.assertEqual(both.object_names, (SOUP, SPAM))
+        assert_array_equal((both.object_mass, both.object_friction), ([0.3, 0.5], [0.6, 0.0]))
 
     def test_another_robot_must_reach_the_goals_too(self):
         goals = load_inputs(toy_goals(load_robot("openarm")), robot=self.robot).data

@@ -244,9 +244,9 @@ class TransferTest(TestCase):
         found, calls = tried(base, data, per_pose=3)
         self.assertEqual([len(names) for _, _, names, *_ in calls], [15])  # 18 candidates
         self.assertEqual(found.frame_index[7:].tolist(), [1] * 3 + [2] * 3 + [3] * 3)
-        none, last, each = [False] * 3, [False, False, True], [True] * 3
         progress = Mock()
-        rounds = [[*none, *last, *each], [False, True, True]]
+        # of three candidates of each pose none holds, the last one, and each
+        rounds = [[False] * 5 + [True] * 4, [False, True, True]]
         found, calls = tried(base, data, verdicts=rounds, per_pose=1, progress=progress)
         self.assertEqual(len(calls), 2, "only the first pose lacks a state after the first round")
         self.assertEqual(found.frame_index[7:].tolist(), [1, 2, 3])

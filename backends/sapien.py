@@ -13,6 +13,8 @@ What differs from SAPIEN's defaults, and why:
 - The robot feels no gravity (if it is compensated), nor does the object, whose weight is part of its force.
 - PhysX reports the normal forces of contacts only; friction is computed from the object's momentum
   (:func:`~xreset.backends.rigid.friction_forces`).
+- Lengths are in 1/32 m. PhysX's search for nearest points (GJK) takes for flat what is thinner than 1e-4. In metres, it
+  misses contacts at the edges of small hulls. Between two boxes it misses by millimetres in any unit: boxes are hulls.
 - Linear velocities refer to the centre of mass; they are converted here. Those of links belong to the poses before the
   last step, so links are computed from the joints. PhysX computes in single precision.
 """
@@ -44,12 +46,15 @@ from xreset.backends.rigid import (
     nearer,
     object_inertia,
     rotate,
+    vertices,
 )
 from xreset.backends.sapien_robot import (
+    LENGTH,
     OBJECT_BIT,
     TABLE_OF_LINKS_BIT,
     TABLE_OF_TIPS_BIT,
     SapienJoints,
+    joint_unit,
     self_collision_bits,
 )
 from xreset.geometry.shapes import perpendicular, transform
@@ -103,11 +108,10 @@ class SapienWorld(World):
         self._renew_scene()
         self._joints.reset(state["joint_pos"], state["joint_vel"], state["joint_target"])
         self._quat = np.array(state["object_quat"])
-        self._object.entity.pose = self._sapien.Pose(state["object_pos"], self._quat)
+        self._object.entity.pose = self._pose(state["object_pos"], self._quat)
         omega = state["object_angvel"]
-        self._object.linear_velocity = state["object_linvel"] + cross(
-            omega, rotate(self._quat, self._inertia.com)
-        )
+        com_velocity = state["object_linvel"] + cross(omega, rotate(self._quat, self._inertia.com))
+        self._object.linear_velocity = LENGTH * com_velocity
         self._object.angular_velocity = omega
 
     def get_state(self) -> StateArrays:
@@ -119,9 +123,9 @@ class SapienWorld(World):
             "joint_pos": position,
             "joint_vel": velocity,
             "joint_target": self._joints.target,
-            "object_pos": pose.p,
+            "object_pos": pose.p / LENGTH,
             "object_quat": self._quat,
-            "object_linvel": self._object.linear_velocity
+            "object_linvel": self._object.linear_velocity / LENGTH
             - cross(omega, rotate(self._quat, self._inertia.com)),
             "object_angvel": omega,
         }
@@ -133,9 +137,9 @@ class SapienWorld(World):
         body = self._object
         for remaining in reversed(range(n)):
             self._joints.brake()
-            body.add_force_torque(self.force, self.torque)
+            body.add_force_torque(LENGTH * self.force, LENGTH**2 * self.torque)
             if not remaining:
-                motion = (body.linear_velocity, body.angular_velocity, body.entity_pose.q)
+                motion = (body.linear_velocity / LENGTH, body.angular_velocity, body.entity_pose.q)
                 self._last_step = (*motion, self.force, self.torque)
             self._system.step()
 
@@ -146,7 +150,7 @@ class SapienWorld(World):
         owners, points, forces = self._contact_points()
         if owners:
             pose = self._object.entity_pose
-            arms = points - (pose.p + _rotation(pose.q) @ self._inertia.com)
+            arms = points - (pose.p / LENGTH + _rotation(pose.q) @ self._inertia.com)
             coefficients = np.array([self._friction[_material(owner)] for owner in owners])
             missing = self._missing_wrench(arms, forces)
             forces = forces + friction_forces(arms, forces, coefficients, *missing)
@@ -158,9 +162,9 @@ class SapienWorld(World):
             frame = body.cmass_local_pose
             inertia = Inertia(
                 mass=body.mass,
-                com=frame.p.astype(float),
+                com=frame.p.astype(float) / LENGTH,
                 quat=frame.q.astype(float),
-                moments=body.inertia.astype(float),
+                moments=body.inertia.astype(float) / LENGTH**2,
             )
             found.append(inertia)
         return found
@@ -188,7 +192,7 @@ class SapienWorld(World):
         self._torsional = torsional
         for shape, owner in self._owners.items():
             mu = self._friction[_material(owner)]
-            shape.min_patch_radius = torsional / mu if mu > 0 else 0.0
+            shape.min_patch_radius = LENGTH * torsional / mu if mu > 0 else 0.0
 
     def set_drives(self, scale: np.ndarray) -> None:
         self._joints.set_drives(scale.astype(np.float64))
@@ -201,9 +205,7 @@ class SapienWorld(World):
         self._attach(body, shape, TABLE, (0, OBJECT_BIT))
         self._attach(body, shape, None, (TABLE_OF_TIPS_BIT, 0), "table of tips")
         self._attach(body, shape, None, (TABLE_OF_LINKS_BIT, 0), "table of links")
-        self._add(
-            body, "table", self._sapien.Pose([*scene.table.center, -scene.table.half_size[2]])
-        )
+        self._add(body, "table", self._pose([*scene.table.center, -scene.table.half_size[2]]))
 
     def _add_object(self, pieces: Sequence[Shape]) -> Any:
         body = self._sapien.physx.PhysxRigidDynamicComponent()
@@ -239,7 +241,7 @@ class SapienWorld(World):
             else:
                 self._set_joint(link.joint, body.joint, body.T_parent_body)
             links.append(link)
-        base = self._sapien.Pose(robot.base_pos, robot.base_quat)
+        base = self._pose(robot.base_pos, robot.base_quat)
         for link, body in zip(links, self._mechanism.bodies, strict=True):
             # the pose of the root decides; joints place the others
             self._add(link, body.name, base)
@@ -249,10 +251,11 @@ class SapienWorld(World):
         T_joint_axis = transform(_x_to(joint.axis), np.zeros(3))
         made.name = joint.name
         made.type = "prismatic" if joint.type == "prismatic" else "revolute_unwrapped"
-        made.pose_in_parent = self._pose(T_parent_body @ T_joint_axis)
-        made.pose_in_child = self._pose(T_joint_axis)
+        made.pose_in_parent = self._frame(T_parent_body @ T_joint_axis)
+        made.pose_in_child = self._frame(T_joint_axis)
         limited = np.isfinite(joint.lower) and np.isfinite(joint.upper)
-        made.limit = [[joint.lower, joint.upper] if limited else [-np.inf, np.inf]]
+        unit = joint_unit(made)
+        made.limit = [[unit * joint.lower, unit * joint.upper] if limited else [-np.inf, np.inf]]
 
     def _attach(
         self,
@@ -273,17 +276,16 @@ class SapienWorld(World):
         """
         physx = self._sapien.physx
         geometry = shape.geometry
-        size = geometry.size
+        size = LENGTH * np.asarray(geometry.size)
         material = self._materials[material_name if owner is None else _material(owner)]
         T = shape.T_body_shape
-        if geometry.kind == "box":
-            made = physx.PhysxCollisionShapeBox(half_size=size, material=material)
-        elif geometry.kind == "sphere":
+        if geometry.kind == "sphere":
             made = physx.PhysxCollisionShapeSphere(radius=size[0], material=material)
-        elif geometry.kind == "hull":
+        elif geometry.kind in ("box", "hull"):
             made = physx.PhysxCollisionShapeConvexMesh(
-                vertices=geometry.vertices, scale=np.ones(3), material=material
+                vertices=LENGTH * vertices(shape), scale=np.ones(3), material=material
             )
+            T = np.eye(4)
         else:
             kind = physx.PhysxCollisionShapeCylinder
             if geometry.kind == "capsule":
@@ -291,7 +293,7 @@ class SapienWorld(World):
             made = kind(radius=size[0], half_length=size[1], material=material)
             along_x = _x_to(np.array([0.0, 0.0, 1.0]))  # as PhysX has them
             T = transform(T[:3, :3] @ along_x, T[:3, 3])
-        made.local_pose = self._pose(T)
+        made.local_pose = self._frame(T)
         made.set_collision_groups([*groups, 0, 0])
         body.attach(made)
         if owner is not None:
@@ -299,11 +301,12 @@ class SapienWorld(World):
 
     def _set_inertia(self, body: Any, inertia: Inertia) -> None:
         body.mass = inertia.mass
-        body.cmass_local_pose = self._sapien.Pose(inertia.com, inertia.quat)
-        body.inertia = inertia.moments
+        body.cmass_local_pose = self._pose(inertia.com, inertia.quat)
+        body.inertia = LENGTH**2 * inertia.moments
         body.linear_damping = body.angular_damping = 0.0
-        body.max_linear_velocity = body.max_angular_velocity = _NO_LIMIT
-        body.max_depenetration_velocity = _PARTING_SPEED
+        body.max_linear_velocity = LENGTH * _NO_LIMIT
+        body.max_angular_velocity = _NO_LIMIT
+        body.max_depenetration_velocity = LENGTH * _PARTING_SPEED
 
     def _add(self, body: Any, name: str, pose: Any) -> None:
         entity = self._sapien.Entity()
@@ -324,8 +327,11 @@ class SapienWorld(World):
         for entity in self._entities:
             self._scene.add_entity(entity)
 
-    def _pose(self, T: np.ndarray) -> Any:
-        return self._sapien.Pose(T[:3, 3], matrix_to_quat(T[:3, :3]))
+    def _pose(self, pos: Any, quat: Any = (1.0, 0.0, 0.0, 0.0)) -> Any:
+        return self._sapien.Pose(LENGTH * np.asarray(pos), quat)
+
+    def _frame(self, T: np.ndarray) -> Any:
+        return self._pose(T[:3, 3], matrix_to_quat(T[:3, :3]))
 
     # Contacts ---------------------------------------------------------------------------------------------------------
 
@@ -347,7 +353,7 @@ class SapienWorld(World):
                     owners.append(owner)
                     points.append(point.position.tolist())
                     impulses.append((sign * x, sign * y, sign * z))
-        return owners, np.array(points), np.array(impulses) / self._dt
+        return owners, np.array(points) / LENGTH, np.array(impulses) / (LENGTH * self._dt)
 
     def _missing_wrench(
         self, arms: np.ndarray, contact_forces: np.ndarray
@@ -362,7 +368,7 @@ class SapienWorld(World):
         R = _rotation(quat)
         omega = angvel.astype(np.float64)
         inertia = R @ self._inertia.matrix @ R.T
-        gained = self._inertia.mass * (self._object.linear_velocity - linvel) / self._dt
+        gained = self._inertia.mass * (self._object.linear_velocity / LENGTH - linvel) / self._dt
         turned = inertia @ (self._object.angular_velocity - omega) / self._dt
         turned = turned + cross(omega, inertia @ omega)
         contact_torques = cross(arms, contact_forces)
@@ -449,7 +455,7 @@ def _configured(physx: Any) -> Iterator[None]:
     body = physx.get_body_config()
     shape = physx.get_shape_config()
     physx.set_scene_config(
-        gravity=np.array([0.0, 0.0, -GRAVITY]),
+        gravity=np.array([0.0, 0.0, -LENGTH * GRAVITY]),
         enable_tgs=True,
         enable_pcm=True,
         enable_enhanced_determinism=True,  # or a world would depend on what was in it before
@@ -461,7 +467,7 @@ def _configured(physx: Any) -> Iterator[None]:
         solver_velocity_iterations=1,
         sleep_threshold=0.0,
     )
-    physx.set_shape_config(contact_offset=_CONTACT_OFFSET, rest_offset=0.0)
+    physx.set_shape_config(contact_offset=LENGTH * _CONTACT_OFFSET, rest_offset=0.0)
     try:
         yield
     finally:

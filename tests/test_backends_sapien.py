@@ -6,16 +6,17 @@ from types import SimpleNamespace
 from unittest import TestCase
 
 import numpy as np
+import trimesh
 from numpy.testing import assert_allclose
 
 from tests.engine_checks import EngineChecks
 from xreset.backends.conformance import run
 from xreset.backends.conformance.scene import gripper, scene, shape, solid
-from xreset.backends.rigid import friction_forces, mechanism
+from xreset.backends.rigid import TABLE, friction_forces, mechanism
 from xreset.backends.sapien import _PARTING_SPEED, SapienBackend, SapienWorld
-from xreset.backends.sapien_robot import _couple, self_collision_bits
+from xreset.backends.sapien_robot import OBJECT_BIT, _couple, self_collision_bits
 from xreset.errors import RobotError
-from xreset.spec import GRAVITY, MimicSpec, SceneSpec
+from xreset.spec import GRAVITY, Geometry, MimicSpec, SceneSpec, Shape
 
 
 class SapienTest(EngineChecks, TestCase):
@@ -57,27 +58,51 @@ class SapienTest(EngineChecks, TestCase):
         # 0.002 rad through three links; alone it would stay
         self.assertLess(max(measure.measured for measure in result.measures), 4e-3)
 
-    def test_an_object_deep_in_the_table_rises_at_the_limit_and_comes_to_rest(self):
-        box = solid("box", 0.4, (shape("box", (0.03, 0.02, 0.025)),))
-        robot = gripper()
-        what = SceneSpec(robot=robot, objects=(box,))
-        world = SapienWorld(what, 0)
-        world.force = np.array([0.0, 0.0, -0.4 * GRAVITY])
-        state = {"joint_pos": robot.home, "joint_target": robot.home}
-        state["joint_vel"] = np.zeros(len(robot.home))
-        state["object_pos"] = np.array([0.4, 0.0, 0.005])  # 20 mm too deep
+    def world(self, what):
+        """A world with an object, without gravity."""
+        world = SapienWorld(SceneSpec(robot=gripper(), objects=(what,)), 0)
+        world.force = world.torque = np.zeros(3)
+        return world
+
+    def put(self, world, pos):
+        """Put the object at rest at a place."""
+        home = gripper().home
+        state = {"joint_pos": home, "joint_target": home, "joint_vel": np.zeros(len(home))}
+        state["object_pos"] = np.array(pos)
         state["object_quat"] = np.array([1.0, 0.0, 0.0, 0.0])
         state["object_linvel"] = state["object_angvel"] = np.zeros(3)
         world.set_state(state)
         world.step(1)
+
+    def test_a_ball_is_pushed_off_the_rim_of_a_hull(self):
+        """In metres, PhysX missed 16 of these 64 contacts."""
+        world = self.world(solid("ball", 0.4, (shape("sphere", (0.012,)),)))
+        can = trimesh.creation.cylinder(0.033, 0.1, sections=32)
+        hull = Geometry(kind="hull", vertices=can.vertices, faces=can.faces)
+        body = world._sapien.physx.PhysxRigidStaticComponent()
+        world._attach(body, Shape(geometry=hull), TABLE, (0, OBJECT_BIT))
+        world._add(body, "can", world._pose([0.4, 0.3, 0.5]))
+        world._scene.add_entity(world._entities[-1])
+        for angle in np.linspace(0.0, 2.0 * np.pi, 64, endpoint=False):
+            # 2 mm deep
+            out = 0.033 * np.cos(np.pi / 32) + 0.007
+            place = np.array([0.4 + out * np.cos(angle), 0.3 + out * np.sin(angle), 0.557])
+            self.put(world, place)
+            moved = world.get_state()["object_pos"] - place
+            self.assertGreater(np.linalg.norm(moved), 1e-3, angle)
+
+    def test_an_object_deep_in_the_table_rises_at_the_limit_and_comes_to_rest(self):
+        world = self.world(solid("box", 0.4, (shape("box", (0.03, 0.02, 0.025)),)))
+        world.force = np.array([0.0, 0.0, -0.4 * GRAVITY])
+        self.put(world, [0.4, 0.0, 0.005])  # 20 mm too deep
         rise = world.get_state()["object_pos"][2] - 0.005
-        self.assertLess(abs(rise / (_PARTING_SPEED * what.timestep) - 1.0), 0.1)
+        self.assertLess(abs(rise / (_PARTING_SPEED * SceneSpec.timestep) - 1.0), 0.1)
         world.step(239)
         self.assertLess(abs(world.get_state()["object_pos"][2] - 0.025), 1e-5)
 
     def test_a_mimic_joint_on_another_branch_than_its_source_is_refused(self):
         def joint(parent, child):
-            return SimpleNamespace(parent_link=parent, child_link=child)
+            return SimpleNamespace(parent_link=parent, child_link=child, type="fixed")
 
         def link(name, parent):
             return SimpleNamespace(name=name, parent=parent)

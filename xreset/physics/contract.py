@@ -31,9 +31,9 @@ Parameter = Literal[
 """A physical parameter with a value per world, set by ``Backend.set_...``."""
 _POSITIVE = ("object_mass", "object_inertia")
 _NOT_NEGATIVE = ("friction", "torsional_friction", "drives")
-Capability = Literal[Parameter, "object_wrench", "overflow", "mass_properties"]
-"""A feature that some backends lack: set a parameter per world, apply a wrench, count overflows, read back masses,
-centers of mass and inertias."""
+Capability = Literal[Parameter, "object_wrench", "mass_properties"]
+"""A feature that some backends lack: set a parameter per world, apply a wrench, read back masses, centers of mass and
+inertias."""
 
 
 @frozen

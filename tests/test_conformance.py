@@ -5,7 +5,7 @@ import unittest
 from dataclasses import replace
 from functools import partial
 from itertools import chain
-from typing import ClassVar
+from typing import ClassVar, get_args
 from unittest import mock
 
 import mujoco
@@ -24,7 +24,7 @@ from xreset.backends.rigid import OTHER_LINK, TABLE, conjugate, rotate
 from xreset.errors import BackendUnavailableError, XResetError
 from xreset.eval.engines import contract
 from xreset.eval.engines.verbs import check_engines
-from xreset.physics import KnownDifference
+from xreset.physics import Capability, KnownDifference
 
 Defect = type[MujocoWorld] | type[MujocoBackend]
 DEFECTS: list[tuple[Defect, tuple[str, ...]]] = []
@@ -576,6 +576,18 @@ class TheSuiteCanFail(unittest.TestCase):
     def test_every_check_has_a_defect_that_it_notices(self):
         noticed = set(chain.from_iterable(checks for _, checks in DEFECTS))
         self.assertEqual({check.name for check in CHECKS} - noticed, set())
+
+    def test_every_capability_is_needed_by_a_check(self):
+        needed = set(chain.from_iterable(check.capabilities for check in CHECKS))
+        self.assertEqual(set(get_args(Capability)) - needed, set())
+
+    def test_a_jaw_whose_contacts_are_missed_says_so(self):
+        class World(WithOtherContacts):
+            def changed(self, tip_force, touch, table_force):
+                return 0.0 * tip_force, touch & False, table_force
+
+        missed, _ = outcome(World, "coupled_jaw")["coupled_jaw"].measures
+        self.assertEqual((missed.what, missed.measured), ("fingers that do not touch", 2.0))
 
     def test_missing_capability_must_be_refused(self):
         lacking = MujocoBackend.capabilities - {"object_gravity"}

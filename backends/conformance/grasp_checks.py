@@ -107,10 +107,14 @@ def coupled_jaw(bench: Bench) -> Measured:
     with bench.other(scene) as worlds:
         worlds.set_parameter("object_gravity", torch.zeros(1))
         end = worlds.advance(start, 2 * SETTLE)
-        force = worlds.contacts().tip_force[0].double()
+        contacts = worlds.contacts()
+    force = contacts.tip_force[0].double()
     rates = bench.kinematics.jacobian(end.joint_pos[0].double(), tips).linear[..., joint]
     asked = drive.kp * (end.joint_target - end.joint_pos)[0, joint]
-    return {"force of the fingers": (force * rates).sum() / asked - 1.0}
+    return {
+        "fingers that do not touch": float((~contacts.tip_touch).sum()),
+        "force of the fingers": (force * rates).sum() / asked - 1.0,
+    }
 
 
 def _heavy_ball() -> ObjectSpec:

@@ -505,7 +505,10 @@ class MeshImport(InFolder):
         self.assertEqual(len(log.output), 1)  # once in a process
         self.assertIn("hollow", log.output[0])  # 66 g in a litre
         for folder, words in (
-            (self.folder, r"'soup'.*011_banana.*the meshes in"),
+            (
+                self.folder,
+                r"'soup'.*011_banana.*the meshes in .* mug.STL as well.* import .*/mug.STL",
+            ),
             (self.folder / "nowhere", "no folder"),
         ):
             self.assertRaisesRegex(ObjectError, words, load_object, "soup", folder)

@@ -459,7 +459,7 @@ def demo_objects(demos: Demos, meshes: str | Path | None = None) -> dict[str, Ob
     """
     names = list(dict.fromkeys(demos.object_name.tolist()))
     try:
-        found = canonical_names(names, object_names(meshes))
+        found = canonical_names(names, object_names(meshes), meshes)
     except ObjectError as error:
         hint = "" if meshes else " Or give a folder of meshes (meshes=... or --meshes)."
         raise DemoError(

@@ -17,6 +17,8 @@ from xreset.spec import ObjectSpec
 
 ALIASES = {alias: name for name, alias in ALIAS_OF.items()}
 """The paper's names -> official names."""
+_OTHERS = (".stl", ".ply", ".glb", ".gltf", ".dae", ".off")
+"""Formats of meshes that an import makes an .obj of."""
 
 
 def object_names(meshes: str | Path | None = None) -> tuple[str, ...]:
@@ -65,11 +67,18 @@ def canonical_name(name: str, known: Iterable[str] = STAND_INS) -> str:
     return canonical_names([name], known)[0]
 
 
-def canonical_names(names: Iterable[str], known: Iterable[str] = STAND_INS) -> tuple[str, ...]:
+def canonical_names(
+    names: Iterable[str], known: Iterable[str] = STAND_INS, folder: str | Path | None = None
+) -> tuple[str, ...]:
     """Return the names of known objects, or of the one of a single name; see :func:`canonical_name`.
 
+    Args:
+        names: the names.
+        known: the known objects.
+        folder: where the meshes of the known objects are.
+
     Raises:
-        ObjectError: names every unknown object.
+        ObjectError: names every unknown object, and its files of another format in the folder.
     """
     names = (names,) if isinstance(names, str) else names
     known = tuple(known)
@@ -93,6 +102,14 @@ def canonical_names(names: Iterable[str], known: Iterable[str] = STAND_INS) -> t
         ]
         what = f"Unknown object{'s' * (len(unknown) > 1)} {', '.join(dict.fromkeys(unknown))}"
         advice = " Other objects need the folder of their meshes." if known is STAND_INS else ""
+        if folder is not None:
+            advice = f" These are the meshes in {folder}: give another folder, or none for the built-in objects."
+            others = [path for path in Path(folder).iterdir() if path.suffix.lower() in _OTHERS]
+            if others:
+                advice += (
+                    f" It has {min(others).name} as well, but only .obj files are read: "
+                    f"xreset objects import {min(others)} --out {folder}"
+                )
         raise ObjectError(f"{what}. Choose from: {', '.join(listing) or 'none'}.{advice}")
     return tuple(found)
 
@@ -145,12 +162,7 @@ def object_source(name: str, meshes: str | Path | None = None) -> str:
 def _mesh_of(name: str, meshes: str | Path) -> tuple[Path, str]:
     """Return the mesh file of an object in a folder, and the name of the object that it makes."""
     files = mesh_files(meshes)
-    try:
-        full = canonical_name(name, files)
-    except ObjectError as error:
-        raise ObjectError(
-            f"{error} These are the meshes in {meshes}: give another folder, or none for the built-in objects."
-        ) from None
+    (full,) = canonical_names([name], files, meshes)
     return files[full], name if name in STAND_INS else full
 
 

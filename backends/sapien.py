@@ -88,6 +88,7 @@ class SapienWorld(World):
         self._entities: list[Any] = []
         self._scene: Any = None
         self._system: Any = None
+        self._steps = 0
         with _configured(sapien.physx):
             self._add_table(scene)
             self._bodies = self._add_robot()
@@ -104,6 +105,8 @@ class SapienWorld(World):
         torque that were given."""
 
     def set_state(self, state: StateArrays) -> None:
+        if self._steps % 2:  # an articulation remembers that, and would differ in the last bits
+            self.step(1)
         self._renew_scene()
         self._joints.reset(state["joint_pos"], state["joint_vel"], state["joint_target"])
         self._quat = np.array(state["object_quat"])
@@ -134,6 +137,7 @@ class SapienWorld(World):
 
     def step(self, n: int) -> None:
         body = self._object
+        self._steps += n
         for remaining in reversed(range(n)):
             self._joints.brake()
             body.add_force_torque(LENGTH * self.force, LENGTH**2 * self.torque)

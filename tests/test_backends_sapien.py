@@ -11,11 +11,12 @@ from numpy.testing import assert_allclose
 
 from tests.engine_checks import EngineChecks
 from xreset.backends.conformance import run
-from xreset.backends.conformance.scene import gripper, scene, shape, solid
+from xreset.backends.conformance.scene import gripper, objects, scene, shape, solid
 from xreset.backends.rigid import TABLE, friction_forces, mechanism
 from xreset.backends.sapien import _PARTING_SPEED, SapienBackend, SapienWorld
 from xreset.backends.sapien_robot import OBJECT_BIT, _couple, self_collision_bits
 from xreset.errors import RobotError
+from xreset.geometry.description import load_robot
 from xreset.spec import GRAVITY, Geometry, MimicSpec, SceneSpec, Shape
 
 
@@ -58,15 +59,15 @@ class SapienTest(EngineChecks, TestCase):
         # 0.002 rad through three links; alone it would stay
         self.assertLess(max(measure.measured for measure in result.measures), 4e-3)
 
-    def world(self, what):
+    def world(self, what, robot=None):
         """A world with an object, without gravity."""
-        world = SapienWorld(SceneSpec(robot=gripper(), objects=(what,)), 0)
+        world = SapienWorld(SceneSpec(robot=robot or gripper(), objects=(what,)), 0)
         world.force = world.torque = np.zeros(3)
         return world
 
     def put(self, world, pos):
         """Put the object at rest at a place."""
-        home = gripper().home
+        home = world._mechanism.robot.home
         state = {"joint_pos": home, "joint_target": home, "joint_vel": np.zeros(len(home))}
         state["object_pos"] = np.array(pos)
         state["object_quat"] = np.array([1.0, 0.0, 0.0, 0.0])
@@ -90,6 +91,16 @@ class SapienTest(EngineChecks, TestCase):
             self.put(world, place)
             moved = world.get_state()["object_pos"] - place
             self.assertGreater(np.linalg.norm(moved), 1e-3, angle)
+
+    def test_the_number_of_steps_before_a_reset_changes_no_bit(self):
+        world = self.world(objects()[0], load_robot("openarm"))
+        found = set()
+        for before in (4, 5, 6):
+            self.put(world, [0.6, 0.2, 0.3])
+            world.step(3)
+            found.add(world.get_state()["joint_vel"].tobytes())
+            world.step(before)
+        self.assertEqual(len(found), 1)
 
     def test_an_object_deep_in_the_table_rises_at_the_limit_and_comes_to_rest(self):
         world = self.world(solid("box", 0.4, (shape("box", (0.03, 0.02, 0.025)),)))

@@ -34,6 +34,7 @@ from xreset.retarget.arm.solve import (
 from xreset.retarget.validity import Thresholds, classify
 from xreset.robot_tools import place as placing
 from xreset.robot_tools.placement import Finalist, PlaceConfig, write_placement
+from xreset.robot_tools.verbs import place_robot
 
 CONFIG = PlaceConfig(x=(0.2, 0.7), y=(0.4, 0.8), z=(0.4, 0.7), rounds=2)
 NOWHERE = np.zeros((0, 3))
@@ -343,6 +344,11 @@ class WritePlacementTest(InFolder):
         )
         self.assertEqual(load(self.folder).base_pos, self.best.robot.base_pos)
         self.assertIn("--write --search.rounds 1", self.lines(True)[0])
+
+    def test_an_installed_robot_is_not_placed_anew(self):
+        expected = r"openarm is an installed robot, .*\(cp -r .*openarm mine\), .* place the copy"
+        with self.assertRaisesRegex(RobotError, expected):
+            place_robot("openarm", "demos.npz", write=True)
 
     def test_refusals(self):
         with self.assertRaisesRegex(

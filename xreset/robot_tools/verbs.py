@@ -10,6 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+from xreset.errors import RobotError
 from xreset.files.checks import Option, Output, Png, PositiveInt, obeys_rules
 from xreset.files.progress import NamedProgress, Progress, unseen
 from xreset.files.storage import this_command
@@ -124,7 +125,7 @@ def place_robot(
         robot: name of a robot, or a folder with a robot.toml.
         demos: archive of demonstrations (xreset demos).
         meshes: folder of real meshes; default: the built-in stand-ins.
-        write: write the placement and its home into the robot's robot.toml.
+        write: write the placement and its home into the robot.toml of a folder.
         search: ranges and effort of the search.
         progress: called with (stage, done, in all).
 
@@ -132,16 +133,23 @@ def place_robot(
         The finalists, those with a home first, and of these the one that follows most.
 
     Raises:
-        RobotError: there is no wrist pose to reach, no room for the base, or the description cannot be changed.
+        RobotError: there is no wrist pose to reach, no room for the base, or the description cannot be changed: that of
+            an installed robot, for example.
     """
     import numpy as np
 
     from xreset.demos.archive import demo_objects, read_demos, rest_on_table
     from xreset.geometry.description import load_robot
-    from xreset.physics.plugins import DESCRIPTION, robot_folder
+    from xreset.physics.plugins import DESCRIPTION, robot_folder, robot_names
     from xreset.retarget.pipeline import wrist_paths
     from xreset.robot_tools.place import place
 
+    folder = robot_folder(robot)
+    if write and str(robot) in robot_names():
+        raise RobotError(
+            f"{robot} is an installed robot, whose policies need it as it is. Copy its folder (cp -r {folder} mine), "
+            "change the name in mine/robot.toml, and place the copy."
+        )
     spec = load_robot(robot)
     every = read_demos(demos)
     chosen = every.select(per_object=_PER_OBJECT, pick="spread")
@@ -152,7 +160,7 @@ def place_robot(
     avoid = np.concatenate((wrists, grounded.object_pos))
     found = place(spec, paths, avoid, search, partial(progress, "placements"))
     if write:
-        write_placement(robot_folder(robot) / DESCRIPTION, spec, found[0], this_command())
+        write_placement(folder / DESCRIPTION, spec, found[0], this_command())
     return found
 
 

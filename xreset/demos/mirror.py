@@ -47,7 +47,7 @@ def symmetry(obj: ObjectSpec) -> Symmetry:
     from xreset.geometry.surface import Surface
 
     surface = Surface(obj)
-    points = surface.samples(_SAMPLES)
+    points, _ = surface.samples(_SAMPLES)
     center = points.mean(axis=0)
 
     def deviations(parameters: np.ndarray, axis: np.ndarray) -> np.ndarray:

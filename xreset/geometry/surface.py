@@ -76,7 +76,8 @@ class Surface:
             index = np.rint((at - origin) / spacing).astype(int).clip(0, counts - 1)
             return inside[tuple(index.T)]
 
-        outward = spacing * np.asarray(mesh.face_normals)[owners]
+        self._normals = np.asarray(mesh.face_normals)
+        outward = spacing * self._normals[owners]
         # not where pieces overlap
         exposed = ~(is_inside(points + outward) & is_inside(points - outward))
         self._owners = owners[exposed]
@@ -102,10 +103,11 @@ class Surface:
             self._signed, self._origin, self._spacing, self.low, self.high
         )
 
-    def samples(self, count: int) -> np.ndarray:
-        """[N, 3] at most ``count`` points, evenly drawn from the samples of the surface."""
-        points = np.asarray(self._tree.data)
-        return points[:: -(-len(points) // count)]
+    def samples(self, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return at most ``count`` points [N, 3], evenly drawn from the samples of the surface, and the unit normals of
+        their triangles [N, 3]."""
+        chosen = slice(None, None, -(-len(self._owners) // count))
+        return np.asarray(self._tree.data)[chosen], self._normals[self._owners[chosen]]
 
     def signed_distance(self, points: np.ndarray) -> np.ndarray:
         """[...] signed distances of points [..., 3], negative inside, from the grid [m].

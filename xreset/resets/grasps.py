@@ -253,9 +253,7 @@ def _axes(across: Tensor, ahead: Tensor) -> Tensor:
 
 def _pairs(surface: Surface, widest: float) -> Tensor:
     """[P, 2, 3] points of a surface that face away from each other and are at most ``widest`` [m] apart."""
-    points = torch.as_tensor(surface.samples(_POINTS))
-    _, normal = surface.field.signed_distance(points, torch.zeros(len(points), dtype=torch.long))
-    normal = torch.nn.functional.normalize(normal, dim=-1)
+    points, normal = map(torch.as_tensor, surface.samples(_POINTS))
     line = points[None] - points[:, None]
     width = line.norm(dim=-1)
     line = line / width.clamp_min(1e-9)[..., None]

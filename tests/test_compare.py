@@ -581,7 +581,7 @@ class FairnessTest(Compared):
                 f"onwards-{seed}", seed=seed, weights=weights, weights_hash="ab" * 32
             )
         text = self.compare("new", "onwards-0", "onwards-1")
-        self.assertIn(f"onwards-1 began with the networks of another training ({file}): ", text)
+        self.assertIn(f"onwards-1 began with the networks of another training ({file}), ", text)
         self.assertIn(f" weights | new | {file} |", text)
 
 

@@ -10,6 +10,7 @@ Shape letters: L states of a bank, K grasps, J hand joints, N tried grasps, S de
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -139,14 +140,8 @@ def planned_grasps(model: HandModel, obj: ObjectSpec) -> Grasps:
     pairs = _pairs(surface, float(jaw.opening[-1]) - 2 * _GAP)
     generator = torch.Generator().manual_seed(0)
     if not len(pairs):
-        nothing = model.home.new_zeros(0, len(model.home))
-        return Grasps(
-            root=model.home.new_zeros(0, 4, 4),
-            joints=nothing,
-            opened=nothing,
-            retreat=model.home.new_zeros(0, 3),
-            missing="too wide",
-        )
+        none = pairs[:, 0, 0]
+        return replace(jaw.grasps(pairs, none, none), missing="too wide")
     found = []
     for _ in range(_ROUNDS):
         drawn = pairs[torch.randint(len(pairs), (_TRIED,), generator=generator)]

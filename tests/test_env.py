@@ -577,7 +577,7 @@ class RobustnessTest(WithEnv):
 
     def test_a_step_with_all_of_it_never_waits_for_the_device(self):
         """As on a GPU, where any of these operations would stop the host until the device is done, and could not be captured."""
-        live, published = (RECIPES[name].config.task for name in ("live", "published"))
+        live, published = (RECIPES[name].task for name in ("live", "published"))
         adaptive = replace(live, reset=replace(live.reset, adaptive_share=0.5))
         for task in (adaptive, published):
             env = self.make(task)
@@ -640,7 +640,7 @@ class ObjectFrameTest(WithEnv, InFolder):
         ]
 
     def test_the_frame_of_a_mesh_does_not_matter(self):
-        live = RECIPES["live"].config.task
+        live = RECIPES["live"].task
         terms = live.reward.terms | {f"{__name__}:lifted": {"weight": 100.0}}
         task = replace(
             live,

@@ -414,7 +414,7 @@ class EngineTest(TestCase):
     def test_the_graph_observes_what_the_environment_observes(self):
         for name in ("paper", "default", "live", "published"):
             with self.subTest(name):
-                self._check(evaluation_task(RECIPES[name].config.task))
+                self._check(evaluation_task(RECIPES[name].task))
         task = evaluation_task(TaskConfig())
         observation = replace(task.observation, policy={"rotation_from_start": {}})
         self._check(replace(task, observation=observation))

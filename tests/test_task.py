@@ -74,7 +74,7 @@ from xreset.task.worlds import Worlds
 
 IDENTITY = tensor([1.0, 0, 0, 0])
 FAR = {"best_reach": 1e3}
-CONFIG = RECIPES["paper"].config
+CONFIG = RECIPES["paper"]
 OPEN = {"near": {"tips": 9.0, "palm": 9.0}}
 
 
@@ -210,7 +210,7 @@ class RewardTest(TestCase):
 
     def test_the_published_reward(self):
         """Numbers from the published paper: -2.5 min(P, 3) - 2.5 min(M, 0.5) + G (3 (1.4 - 3 d) + [d <= 0.02] 15 / (1 + 10 d))."""
-        config = RECIPES["published"].config.task.reward
+        config = RECIPES["published"].task.reward
         for tips, palm, shift, degrees, gate in (
             (0.15, 0.1, 0.0, 0.0, True),
             (0.15, 0.1, 0.015, 0.0, True),
@@ -365,7 +365,7 @@ class EarlierOptionsTest(TestCase):
             ("live", DEFAULT | live),
             ("published", PUBLISHED),
         ):
-            task = RECIPES[name].config.task
+            task = RECIPES[name].task
             found = from_dict(TaskConfig, options)
             expected = deepcopy(task.reward)
             # Only recipes of today ask the tips of a jaw to oppose each other.
@@ -1229,7 +1229,7 @@ class ObservationTest(TestCase):
         assert_close(quat_angle(corrected, x.goal_quat), torch.zeros(self.N), atol=2e-3, rtol=0)
 
     def test_with_cameras_a_goal_does_not_depend_on_the_axes_of_a_mesh(self):
-        c = RECIPES["live"].config.task.observation
+        c = RECIPES["live"].task.observation
         widths = obs.layout(self.J, self.E, c, VisionConfig(cameras=(FRONT,)))
         self.assertEqual([*widths], ["goal", "proprio", "view"])
         self.assertEqual([*widths["goal"]], ["goal_pos", "rotation_from_start", "previous_action"])
@@ -1242,7 +1242,7 @@ class ObservationTest(TestCase):
         assert_close(observed("goal", replace(self.x, **quats)), observed("goal", self.x))
 
     def test_the_published_observation(self):
-        c = RECIPES["published"].config.task.observation
+        c = RECIPES["published"].task.observation
         widths = obs.layout(28, 5, c)
         flat = sum(widths["policy"].values()) + sum(widths["proprio"].values())
         # the paper's 648 inputs
@@ -1260,7 +1260,7 @@ class ObservationTest(TestCase):
 
     def test_the_layout_has_the_widths_and_the_order_of_the_groups(self):
         for name, recipe in RECIPES.items():
-            c = recipe.config.task.observation
+            c = recipe.task.observation
             x = replace(self.x, points=torch.zeros(self.N, c.cloud_points, 3))
             for group, widths in obs.layout(self.J, self.E, c).items():
                 value = obs.Observer(c).group(group, x)

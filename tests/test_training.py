@@ -220,7 +220,7 @@ class TrainingTest(WithBank):
         """The published one takes the longest steps through the network, so the network is small here."""
         for name in ("published", "live"):
             with self.subTest(name):
-                base = RECIPES[name].config
+                base = RECIPES[name]
                 small = replace(base.model, lstm=16)
                 config = replace(
                     base, model=small, ppo=replace(base.ppo, mini_epochs=1), iterations=1
@@ -394,7 +394,7 @@ class TrainingTest(WithBank):
     def test_a_recipe_may_be_a_file_of_the_users_own(self):
         path = self.folder / "mine.toml"
         path.write_text('extends = "live"\niterations = 7\nmodel.lstm = 64\n')
-        live = RECIPES["live"].config
+        live = RECIPES["live"]
         expected = replace(live, iterations=7, model=replace(live.model, lstm=64))
         self.assertEqual(starting_config(str(path)), expected)
         for text, problem in (
@@ -410,7 +410,7 @@ class TrainingTest(WithBank):
             with refuses(self, problem, XResetError, text):
                 starting_config(str(path))
         path.write_text("")
-        self.assertEqual(starting_config(str(path)), RECIPES["default"].config)
+        self.assertEqual(starting_config(str(path)), RECIPES["default"])
         path.write_text('task.reward.terms."no_such_module:term".weight = 1.0')
         with redirect_stderr(io.StringIO()) as said:
             self.assertEqual(starting_config(str(path)).task.reward.own, {})
@@ -455,14 +455,14 @@ class TrainingTest(WithBank):
             return calls[0]["config"]
 
         self.assertEqual(parsed(), TrainConfig())
-        self.assertEqual(RECIPES["default"].config, TrainConfig())
+        self.assertEqual(RECIPES["default"], TrainConfig())
         live = parsed("--recipe live --config.ppo.entropy 0.001")
         self.assertEqual(
             (live.ppo.desired_kl, live.ppo.entropy, live.model.initial_std), (0.02, 0.001, 0.3)
         )
         without = replace(live.task, randomization=TrainConfig().task.randomization)
         ppo = replace(live.ppo, entropy=0.0)
-        self.assertEqual(replace(live, task=without, ppo=ppo), RECIPES["any_object"].config)
+        self.assertEqual(replace(live, task=without, ppo=ppo), RECIPES["any_object"])
         self.assertEqual(
             parsed(f"--recipe={self.out} --config.save-interval 7"),
             replace(CONFIG, save_interval=7),
@@ -470,8 +470,9 @@ class TrainingTest(WithBank):
         for arguments, problem in (
             (
                 "--recipe nothing",
-                "no recipe, file, run folder or policy 'nothing'. Recipes: default, .*; paper, the paper's tables",
+                "no recipe, file, run folder or policy 'nothing'. Recipes: default, paper, any_object",
             ),
+            ("--weights many-object", r"or policy 'many-object'.* \(--weights\): .*many-objects,"),
             (f"--recipe {self.folder}", "is not a run folder"),
         ):
             with self.subTest(arguments):

@@ -14,45 +14,30 @@ from typing import Any
 
 from xreset.cameras.config import VisionConfig
 from xreset.errors import PolicyError, RunError
-from xreset.files.checks import from_dict, frozen, merged
+from xreset.files.checks import from_dict, merged
 from xreset.files.storage import read_toml
 from xreset.files.text import plain, shown
 from xreset.learning.config import ModelConfig, PpoConfig, TrainConfig
 from xreset.learning.run import read_run
-from xreset.policy.shipped import shipped_name
+from xreset.policy.shipped import shipped_checkpoints, shipped_name
 from xreset.spec import RobotSpec
 from xreset.task.config import TaskConfig
 
 
-@frozen
-class Recipe:
-    """A configuration and what it is for."""
-
-    config: TrainConfig
-    about: str
-
-
-def _read_recipes() -> dict[str, Recipe]:
+def _read_recipes() -> dict[str, TrainConfig]:
     paper = TrainConfig(task=TaskConfig(), model=ModelConfig(), ppo=PpoConfig(), iterations=10_000)
-    recipes = {
-        "default": Recipe(
-            config=TrainConfig(),
-            about="the recipe of the headline results, for 25 minutes on one GPU",
-        ),
-        "paper": Recipe(
-            config=paper, about="the paper's tables VIII and IX, for hours on several GPUs"
-        ),
-    }
+    recipes = {"default": TrainConfig(), "paper": paper}
     for name, changes in tomllib.loads(_FILE.read_text()).items():
-        about = changes.pop("about")
-        recipes[name] = Recipe(config=_changed(changes, recipes, f"{_FILE}: {name}"), about=about)
+        recipes[name] = _changed(changes, recipes, f"{_FILE}: {name}")
     return recipes
 
 
-def _changed(changes: dict[str, Any], recipes: Mapping[str, Recipe], where: str) -> TrainConfig:
+def _changed(
+    changes: dict[str, Any], recipes: Mapping[str, TrainConfig], where: str
+) -> TrainConfig:
     """Return the configuration of a recipe as it is written, which may extend one of ``recipes``."""
     base = changes.pop("extends", None)
-    config = asdict(recipes[base].config if base else TrainConfig())
+    config = asdict(recipes[base] if base else TrainConfig())
     for table in changes.pop("replaces", ()):
         reduce(dict.__getitem__, table.split("."), config).clear()
     return from_dict(TrainConfig, merged(config, _with_none(changes)), where)
@@ -100,7 +85,7 @@ def _with_none(changes: dict[str, Any]) -> dict[str, Any]:
 _FILE = Path(__file__).with_name("recipes.toml")
 _STUDENT = _FILE.with_name("student.toml")
 RECIPES = _read_recipes()
-"""Name -> recipe."""
+"""Name of the recipe -> configuration."""
 
 
 def starting_config(recipe: str) -> TrainConfig:
@@ -119,13 +104,13 @@ def starting_config(recipe: str) -> TrainConfig:
         PolicyError: the policy is damaged, or sees through cameras.
     """
     if recipe in RECIPES:
-        return RECIPES[recipe].config
+        return RECIPES[recipe]
     if is_policy(recipe):
         config = _config_of_policy(recipe)
     elif not Path(recipe).exists():
-        known = "; ".join(f"{name}, {each.about}" for name, each in RECIPES.items())
         raise RunError(
-            f"There is no recipe, file, run folder or policy {recipe!r}. Recipes: {known}."
+            f"There is no recipe, file, run folder or policy {recipe!r}. Recipes: {', '.join(RECIPES)}. Policies whose "
+            f"networks a training can start with (--weights): {', '.join(shipped_checkpoints())}."
         )
     elif recipe.endswith(".toml"):
         config = read_recipe(Path(recipe))
@@ -223,5 +208,5 @@ def student_config(teacher: TaskConfig, vision: VisionConfig) -> TrainConfig:
     changes = tomllib.loads(_STUDENT.read_text())
     latency = round(1 / 30 / teacher.control_dt, 3)
     changes["task"]["randomization"]["camera_latency"] = [0.0, latency]
-    base = asdict(replace(RECIPES["paper"].config, task=task))
+    base = asdict(replace(RECIPES["paper"], task=task))
     return from_dict(TrainConfig, merged(base, changes), str(_STUDENT))

@@ -138,7 +138,7 @@ def pushed_object(bench: Bench) -> Measured:
             contacts = worlds.contacts()
             forces.append(torch.stack((contacts.tip_force[0, 0, 0], contacts.table_force[0, 2])))
     pushing = torch.stack(forces) > 0.01 * GRAVITY * scene.objects[0].mass
-    touched = int(pushing[:, 0].nonzero()[0])
+    touched = int(pushing[:, 0].float().argmax())
     away = 1.0 - pushing[touched + round(0.1 / scene.timestep) :].float().mean(0)
     return {"without the foot": away[0], "without the table": away[1]}
 
@@ -201,10 +201,10 @@ def _on(scene: SceneSpec, places: Sequence[str], depth: float = _DEPTH) -> State
 
 
 def _press(scene: SceneSpec, state: State) -> Tensor:
-    """[N] force of the drive that presses, at rest."""
+    """[N] force of the drive that presses, at rest; never 0, because others are divided by it."""
     index = scene.robot.joint_names.index("press")
     drive = scene.robot.joints[index].drive
-    return drive.kp * (state.joint_pos - state.joint_target)[:, index]
+    return (drive.kp * (state.joint_pos - state.joint_target)[:, index]).clamp_min(1e-6)
 
 
 def _dragged(worlds: Worlds, scene: SceneSpec, start: State) -> Tensor:

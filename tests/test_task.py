@@ -99,6 +99,10 @@ def one_number(x):
     return x.object_pos[:, 2].mean()
 
 
+def misspelt(x):
+    return x.object_position
+
+
 def near(distance, width):
     return 1 - math.tanh(distance / width)
 
@@ -276,6 +280,7 @@ class RewardTest(TestCase):
             (f"{__name__}:no_such_function", {}, RunError, "test_task.py has no function 'no_such_function'"),
             (f"{__name__}:IDENTITY", {}, RunError, "test_task.py has no function 'IDENTITY'"),
             (f"{__name__}:one_number", {}, RunError, r"gave \(\). Return a tensor of shape \(1,\)"),
+            (f"{__name__}:misspelt", {}, RunError, r"line \d+ of .*test_task.py: AttributeError: .*'object_position'"),
             (f"{__name__}:height", {"most": 1.0}, ValueError, r"height does not fit height .unknown: most; known: "),
             ("raech", {"width": 1.0}, ValueError, "Unknown reward term 'raech'. One of your own is named module:function. Choose from: reach, best_reach"),
             ("reach", {"width": -1.0}, ValueError, r"terms\.reach\.width is -1.0, expected a number above 0"),

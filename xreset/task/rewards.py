@@ -14,6 +14,8 @@ r = -2.5 min(P, 3) - 2.5 min(M, 0.5) + G 3 (1.4 - 3 d) + G [d <= 0.02] 15 / (1 +
 
 from __future__ import annotations
 
+import traceback
+from collections.abc import Callable
 from dataclasses import field, replace
 from functools import cached_property
 
@@ -312,7 +314,7 @@ class RewardFunction:
         success = torch.zeros_like(gate)
         terms = {}
         for name, function in self._terms.items():
-            value = _checked(name, function(x), x.best_reach)
+            value = _value(name, function, x)
             if name == "success":
                 success = value.abs() > 0  # False where the value is NaN
             terms[name] = self._weights[name] * value
@@ -321,7 +323,18 @@ class RewardFunction:
         return Reward(total=total, terms=terms, grasped=grasped, gate=gate, success=success)
 
 
-def _checked(name: str, value: Tensor, like: Tensor) -> Tensor:
+def _value(name: str, function: Callable[[RewardInput], Tensor], x: RewardInput) -> Tensor:
+    like = x.best_reach
+    try:
+        value = function(x)
+    except Exception as error:
+        if ":" not in name:
+            raise
+        place = traceback.extract_tb(error.__traceback__)[:2][-1]  # the line of the user's function
+        what = f"{type(error).__name__}: {error}"
+        raise RunError(
+            f"The reward term {name!r} failed in line {place.lineno} of {place.filename}: {what}. Correct the function."
+        ) from error
     if not isinstance(value, Tensor) or value.shape != like.shape:
         found = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
         raise RunError(

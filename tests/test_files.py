@@ -636,7 +636,7 @@ class BankTest(InFolder):
         bank = toy_bank(self.robot)
         for words, changes in (
             (
-                "'object_pos' holds .*, expected numbers from -100 to 100",
+                "'object_pos' holds .*, expected numbers from -100 to 100. Units are metres",
                 {"object_pos": bank.object_pos + 1000},
             ),
             ("'object_pos' has shape .* but L = 5", {"joint_pos": bank.joint_pos[:5]}),

@@ -176,6 +176,8 @@ class Synthetic(InFolder):
         with self.assertRaisesRegex(FileFormatError, "no schema, .*archive of xreset demos"):
             read_demos(self.npz())
         (self.folder / "empty").mkdir()
+        with self.assertRaisesRegex(FileFormatError, "there is no .*b.csv .a tracker's keypoints"):
+            read_keypoints(self.folder / "b.csv", PLAIN)
         with self.assertRaisesRegex(DemoError, "no .npz and no .csv"):
             read_keypoints(f"{self.folder}/empty", PLAIN)
 

@@ -27,7 +27,7 @@ from xreset.demos.hand import ORDERS, Order
 from xreset.errors import DemoError
 from xreset.files.checks import frozen, is_rigid
 from xreset.files.records import POSITION, RATE, UNIT_TOLERANCE, Arrays, Field, read_npz
-from xreset.files.storage import max_bytes
+from xreset.files.storage import max_bytes, must_exist
 from xreset.files.text import is_plain, shown
 from xreset.geometry.shapes import transformed
 from xreset.objects.catalogue import official_name
@@ -178,6 +178,7 @@ def read_transform(path: str | Path) -> np.ndarray:
 def _read_csv(path: Path, name: str) -> Iterator[Arrays]:
     """Yield the arrays of each sequence of a table with one row for each frame, as an npz would hold them; an empty
     cell is NaN. The rows of a sequence follow one another."""
+    must_exist(path, "a tracker's keypoints")
     try:
         table = _table(path)
         arrays = {}

@@ -344,8 +344,10 @@ def wrong_value(arrays: Arrays, schema: Schema) -> str | None:
         low, high = field.within
         outside = array[(array < low) | (array > high)]
         if outside.size:
+            units = " Units are metres and radians." if field.within == POSITION else ""
             return (
                 f"array {name!r} holds {outside[0]:.6g}, expected numbers from {low:g} to {high:g}."
+                f"{units}"
             )
         if field.unit:
             lengths = np.linalg.norm(array.astype(np.float64), axis=-1)

@@ -144,7 +144,7 @@ class InputsTest(InOneFolder):
         for file in (motion, bank):  # from where the folder has the robot's name
             self.assertEqual(load_inputs(file).robot_name, str(folder / "mine"), file.name)
         shutil.move(folder / "mine", folder / "gone")
-        words = "Unknown robot 'mine', and no folder has that name.*give the robot's folder"
+        words = "Unknown robot 'mine', and no folder has that name.*--robot"
         with self.assertRaisesRegex(RobotError, words):
             load_inputs(bank)
 

@@ -461,10 +461,7 @@ def demo_objects(demos: Demos, meshes: str | Path | None = None) -> dict[str, Ob
     try:
         found = canonical_names(names, object_names(meshes), meshes)
     except ObjectError as error:
-        hint = "" if meshes else " Or give a folder of meshes (meshes=... or --meshes)."
-        raise DemoError(
-            f"The demonstrations need objects that are not there. {error}{hint}"
-        ) from None
+        raise DemoError(f"The demonstrations need objects that are not there. {error}") from None
     for name, full in zip(names, found, strict=True):
         if full != name and name not in STAND_INS:
             raise DemoError(

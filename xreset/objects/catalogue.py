@@ -101,7 +101,9 @@ def canonical_names(
             f"{other} ({ALIAS_OF[other]})" if other in ALIAS_OF else other for other in known
         ]
         what = f"Unknown object{'s' * (len(unknown) > 1)} {', '.join(dict.fromkeys(unknown))}"
-        advice = " Other objects need the folder of their meshes." if known is STAND_INS else ""
+        advice = ""
+        if known is STAND_INS:
+            advice = " Other objects need the folder of their meshes (meshes=... or --meshes)."
         if folder is not None:
             advice = f" These are the meshes in {folder}: give another folder, or none for the built-in objects."
             others = [path for path in Path(folder).iterdir() if path.suffix.lower() in _OTHERS]

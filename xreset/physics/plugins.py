@@ -112,8 +112,8 @@ def robot_folder(name_or_folder: str | Path) -> Path:
             raise RobotError(f"{folder} is a file. {fix}")
         known = known_plugins(ROBOTS)
         raise RobotError(
-            f"Unknown robot {shown(name)}, and no folder has that name. Choose from: {known}; or give the robot's "
-            "folder, with --robot if a file names the robot."
+            f"Unknown robot {shown(name)}, and no folder has that name. Choose from: {known}; or give the folder of a "
+            "robot of your own (--robot)."
         )
     module = load_plugin(ROBOTS, name)
     if not isinstance(module, ModuleType) or not module.__file__:

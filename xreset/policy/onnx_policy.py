@@ -118,8 +118,8 @@ def check_contract(source: str, contract: Contract, robot: RobotSpec, task: Task
 def of_another_robot(source: str, trained: str, wanted: str) -> PolicyError:
     """Return the refusal of a policy, given the names of its robot and of the robot that shall play it."""
     return PolicyError(
-        f"{source} is a policy of the robot {trained!r}, not of {wanted!r}: use {trained!r}, or another policy "
-        "(xreset policies lists those that ship)."
+        f"{source} is a policy of the robot {trained!r}, not of {wanted!r}. Give a policy of {wanted!r} (xreset "
+        f"policies lists those that ship), or use the robot {trained!r}."
     )
 
 

@@ -291,7 +291,9 @@ class UsageTest(TestCase):
     def test_help_shows_a_switch_that_is_off_without_its_opposite(self):
         shown = set()
         for words in (*commands(), ["train", "--help-config task.reset"]):
-            shown |= set(re.findall(r"--\S*no-[a-z-]+", run(*words, "--help")[1]))
+            text = run(*words, "--help")[1]
+            shown |= set(re.findall(r"--\S*no-[a-z-]+", text))
+            self.assertNotRegex(text, r"\(default:[\s│]+(False)?\)")
         self.assertEqual(shown, {"--no-video"}, "films are drawn unless the user says no")
         self.assertIn("no none.npz", refused("demos select none.npz --no-mirror"), "still taken")
 

@@ -156,7 +156,7 @@ def perform(argv: list[str]) -> None:
         if not arguments or (arguments[0].startswith("-") and not asks_for_help(arguments[:1])):
             call(command[""], arguments)
             return
-        text += f"\n\nxreset {name} without a verb: {description(command[''])}"
+        text += f"\n\nxreset {name} alone: {description(command[''])}"
     for count in (2, 1):  # a verb may have two words
         verb = " ".join(arguments[:count])
         if verb in command:
@@ -183,4 +183,5 @@ def _usage() -> str:
         fill(f"  {name:<{width}}  {text}", columns, subsequent_indent=" " * (width + 4))
         for name, text in COMMANDS.items()
     )
-    return f"usage: xreset COMMAND ...\n\n{lines}\n\nxreset COMMAND --help shows the options of one command."
+    help = "xreset COMMAND --help shows the options of one command, xreset --version the version."
+    return f"usage: xreset COMMAND ...\n\n{lines}\n\n{help}"

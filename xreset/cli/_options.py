@@ -78,18 +78,23 @@ def checked(command: Callable[..., None]) -> Callable[..., None]:
     run.__doc__ = _shortened(command.__doc__ or "")
     run.__annotations__ = {**hints}
     for each in signature(command).parameters.values():
-        if each.default is None:  # the text says what happens then
-            run.__annotations__[each.name] = Annotated[hints[each.name], arg(help_behavior_hint="")]
+        if each.default is None or each.default == ():  # the text says what happens then
+            run.__annotations__[each.name] = _without_default(hints[each.name])
         elif each.default is False:
             run.__annotations__[each.name] = _switch(hints[each.name])
     vars(run)["__signature__"] = signature(command)
     return run
 
 
+def _without_default(hint: Any) -> Any:
+    """Return the type of an option whose default help does not show."""
+    return Annotated[hint, arg(help_behavior_hint="")]
+
+
 def _switch(hint: Any) -> Any:
     """Return the type of a switch that is off by default. Help shows it without the flag that turns it off."""
     is_shown = any(word == "-h" or word.startswith("--help") for word in INVOCATION)
-    return Annotated[hint, FlagCreatePairsOff] if is_shown else hint
+    return Annotated[_without_default(hint), FlagCreatePairsOff] if is_shown else hint
 
 
 def refuse_empty(words: Iterable[str]) -> None:
@@ -191,7 +196,11 @@ def _group(info: StructTypeInfo) -> StructConstructorSpec | None:
     fields = []
     for field in spec.fields:
         text = field.helptext() if callable(field.helptext) else field.helptext
-        kind = _switch(field.type) if field.default is False else field.type
+        kind = field.type
+        if field.default is False:
+            kind = _switch(kind)
+        elif field.default in ((), {}):
+            kind = _without_default(kind)
         fields.append(replace(field, type=kind, helptext=" ".join(text.split()) if text else None))
     return replace(spec, fields=tuple(fields))
 

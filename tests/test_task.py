@@ -1277,10 +1277,14 @@ class ObservationTest(TestCase):
         x = replace(self.x, points=points)
         now = quat_rotate(self.x.observed_quat[2], points[2, 7]) + self.x.observed_pos[2]
         goal = quat_rotate(self.x.goal_quat[2], points[2, 7]) + self.x.goal_pos[2]
+        palm, frame = self.x.links.pos[2, 0], self.x.links.quat[2, 0]
+        of_palm = quat_rotate(quat_conjugate(frame), now - palm)
+        near = 5.0 * torch.cat((now, of_palm, goal - now))
         for name, parameters, expected in (
             ("cloud", {"frames": 3, "scale": 1.0}, now),
             ("cloud", {"frames": 1, "scale": 5.0}, 5.0 * now),
             ("paired_cloud", {"scale": 5.0}, 5.0 * torch.cat((now, goal, goal - now))),
+            ("paired_cloud", {"scale": 5.0, "palm": True}, near),
         ):
             c = ObservationConfig(perception={name: {"noise": 0.0} | parameters}, cloud_points=10)
             cloud = obs.Observer(c).group("perception", x)

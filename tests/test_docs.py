@@ -212,9 +212,13 @@ class PageTest(TestCase):
         packages = {name.partition(".")[0] for name in imported} - {"xreset"}
         self.assertLessEqual(packages - sys.stdlib_module_names, names)
 
-    def test_every_public_name_is_in_the_reference(self):
-        import xreset
+    def test_the_help_of_a_public_function_begins_on_the_first_screen(self):
+        for name in xreset.__all__:
+            value = getattr(xreset, name)
+            if inspect.isfunction(value):
+                self.assertLess(len(str(inspect.signature(value))), 1000, name)
 
+    def test_every_public_name_is_in_the_reference(self):
         headings = set(
             re.findall(
                 r"^::: xreset\.(\w+)$", (ROOT / "docs/reference.md").read_text(), re.MULTILINE

@@ -66,7 +66,7 @@ def make_env(
     robot: RobotSpec,
     objects: Sequence[ObjectSpec],
     bank: ResetBank,
-    task: TaskConfig = TASK,
+    task: TaskConfig | None = None,
     *,
     engine: str = "mujoco",
     num_envs: PositiveInt = 16,
@@ -91,6 +91,7 @@ def make_env(
         DemoError: the bank has no demonstration of an object.
         XResetError: ``task.reset.object_share`` names an unknown object, or an object gets no world.
     """
+    task = task or TASK
     objects = checked_objects(robot, objects)
     check_states(bank, robot, objects)
     scene = make_scene(robot, objects, task)

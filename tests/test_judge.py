@@ -48,6 +48,20 @@ class Judge(InFolder):
         rise = np.diff(found.shots["brick"][:, -5])  # of the object's z
         self.assertGreater(rise[1], 0.08)
 
+    def test_the_tightest_grasp_of_each_demonstration_is_tried_first(self):
+        """In the fourth state one finger is nearer to the brick than in the third, and the other farther."""
+        own = bank()
+        jaws = [0.0206, 0.0205, 0.024, 0.023, 0.027, 0.027]
+        own.joint_pos[:, robot().joint_names.index("jaw_a_slide")] = jaws
+        home = torch.as_tensor(robot().home)
+        across = Kinematics(robot()).link_poses(home, ["wrist"])[0, :3, 0].numpy()
+        own.object_pos[3] += 0.0025 * across
+        own.post_contact[:] = True
+        with patch.object(judging, "probe", return_value=np.zeros((2, 40))) as tried:
+            judge(own, robot(), (brick(),), states=2)
+        found = tried.call_args.args[3].joint_pos
+        assert_allclose(found, own.joint_pos[[1, 2]])
+
     def test_the_origin_of_a_mesh_may_be_anywhere(self):
         """This one moves by centimeters where the brick turns a little in the hand."""
         shift = np.array([0, 40.0, 40.0])

@@ -239,7 +239,9 @@ class MeshImport(InFolder):
         self.assertAlmostEqual(result.obj.mass, DEFAULT_DENSITY * 0.1 * 0.06 * 0.04)
         expected = result.obj.mass / 12 * np.array([0.0052, 0.0116, 0.0136])
         assert_allclose(np.diag(result.obj.inertia), expected, rtol=1e-6)
-        self.assertRegex(result.notes[0], "mass is unknown.*State `mass` in thing.toml")
+        self.assertRegex(
+            result.notes[0], "mass is unknown.*next to the mesh, in thing.toml: mass = "
+        )
         self.assertEqual(result.mass_source, "500 kg/m^3")
         self.assertEqual(self.load(BOX, facts="mass = 0.2").obj.mass, 0.2)
         mug = self.load(BOX, "025_mug")

@@ -503,6 +503,7 @@ class PipelineTest(InOneFolder):
         self.assertIn(words, said)
         self.assertIn("1 of 1 sequences are of left hands, but the robot's hand is a right", said)
         self.assertIn("select --side right; --mirror makes right hands of the others", said)
+        self.assertRegex(said, r"frames +. +kept +. +rejected[\s\S]*xreset view shows why")
         self.assertIn(words, stated_doubts(out)[0])
 
     def test_the_file_says_what_the_robot_does(self):

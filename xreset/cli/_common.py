@@ -41,7 +41,7 @@ def quick_engines(names: Sequence[str], device: str) -> list[str]:
 
 def show_accounts(rows: Sequence[Account], title: str) -> None:
     """Print how many frames or states of each object and phase are kept, and why the others are rejected."""
-    table = [("object", "phase", "in all", "kept", "others")]
+    table = [("object", "phase", "frames", "kept", "rejected")]
     for row in rows:
         kept = f"{row.kept} ({row.kept / row.total:.0%})" if row.total else "0"
         table.append((row.object_name, row.phase, str(row.total), kept, described(row.lost)))

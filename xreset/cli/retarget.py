@@ -35,14 +35,15 @@ def _show(motion: Retargeted, options: Mapping[str, Any]) -> None:
         show_notes([note])
     show_accounts(
         [row.without("not annotated") for row in motion.accounts()],
-        f"annotated frames retargeted to {motion.robot}: those that are valid",
+        f"{motion.robot}: annotated frames that are valid",
     )
     if motion.annotated.any():
         console.print(_distances(motion))
         took = 1e3 * options["seconds"] / motion.annotated.sum()
         console.print(f"{took:.0f} ms a frame, with all preparation")
+    valid = quantity(int(motion.valid.sum()), "valid frame")
     console.print(
-        f"{quantity(int(motion.valid.sum()), 'valid frame')} of {len(motion.valid)} in {options['out']}"
+        f"{valid} of {len(motion.valid)} in {options['out']}; xreset view shows why the others are not"
     )
 
 

@@ -199,7 +199,7 @@ def _guessed_mass(
     if own.density is None:
         notes.append(
             f"its mass is unknown: {density * volume:.3g} kg is assumed, by a density of"
-            f" {density:.0f} kg/m^3. State `mass` in {properties_file(path).name}"
+            f" {density:.0f} kg/m^3. State it next to the mesh, in {properties_file(path).name}: mass = 0.12"
         )
     return density * volume, f"{density:g} kg/m^3"
 

@@ -23,7 +23,15 @@ from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.shapes import turn_of
 from xreset.objects.rest import rest_height
 from xreset.resets.bank import starts_and_goals
-from xreset.resets.goals import FAMILIES, SCHEMA, drawn_goals, read_goals, with_goals, write_goals
+from xreset.resets.goals import (
+    FAMILIES,
+    SCHEMA,
+    checked_goals,
+    drawn_goals,
+    read_goals,
+    with_goals,
+    write_goals,
+)
 from xreset.resets.inputs import load_inputs
 from xreset.resets.reach import Reach
 from xreset.resets.verbs import make_goals
@@ -56,9 +64,6 @@ class MadeTest(InOneFolder):
         assert_allclose(
             goals.start_pos[:, 2], rest_height(self.banana, goals.start_quat_wxyz), atol=2e-3
         )
-        self.assertTrue(
-            (goals.goal_pos[:, 2] > rest_height(self.banana, goals.goal_quat_wxyz)).all()
-        )
         ups = turn_of(goals.start_quat_wxyz).inv().apply([0.0, 0.0, 1.0])
         self.assertLess((ups @ ups.T).min(), 0.9, "the banana rests on one side only")
         shift = self.centers(goals, "goal") - self.centers(goals, "start")
@@ -84,6 +89,26 @@ class MadeTest(InOneFolder):
         most = np.abs(moved).max(axis=0) / [0.02, 0.02, 25.0]
         self.assertTrue(((most > 0.5) & (most < 1.0001)).all(), most)
         self.assertEqual(len(np.unique(middle.start_quat_wxyz.round(3), axis=0)), 8, "any turn")
+
+    def test_goals_are_above_the_table_and_grasps_turn_with_the_object(self):
+        turns = []
+
+        def holds(_, start, goal, turn):
+            turns.append(turn)
+            return np.ones(len(start), dtype=bool)
+
+        self.enterContext(patch.object(Reach, "holds", holds))
+        offsets = {"START_OFFSET": np.zeros(3), "GOAL_OFFSET": np.array([0.0, 0.0, 0.5, 0.0])}
+        with patch.multiple("xreset.resets.goals", **offsets):
+            goals = make_goals(["banana"], robot=self.robot, families="tilt-x", per_family=8)
+        lowest = rest_height(self.banana, goals.goal_quat_wxyz)
+        self.assertTrue((goals.goal_pos[:, 2] >= lowest - 1e-6).all())
+        self.assertGreater(len(turns), 1, "some were drawn again")
+        other = replace(goals, robot_fingerprint="another")
+        checked_goals("goals", other, self.robot, [self.banana])
+        for turn in turns:  # about the world's x axis
+            expected = np.tile(np.radians([60.0, 0, 0]), (len(turn), 1))
+            assert_allclose(np.abs(turn.as_rotvec()), expected, atol=1e-5)
 
     def test_the_origin_of_a_mesh_may_be_anywhere(self):
         shift = np.array([2.0, 1.0, -3.0])

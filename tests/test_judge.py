@@ -52,15 +52,17 @@ class Judge(InFolder):
         """In the fourth state one finger is nearer to the brick than in the third, and the other farther."""
         own = bank()
         jaws = [0.0206, 0.0205, 0.024, 0.023, 0.027, 0.027]
-        own.joint_pos[:, robot().joint_names.index("jaw_a_slide")] = jaws
+        jaw = robot().joint_names.index("jaw_a_slide")
+        own.joint_pos[:, jaw] = jaws
         home = torch.as_tensor(robot().home)
         across = Kinematics(robot()).link_poses(home, ["wrist"])[0, :3, 0].numpy()
         own.object_pos[3] += 0.0025 * across
         own.post_contact[:] = True
         with patch.object(judging, "probe", return_value=np.zeros((2, 40))) as tried:
             judge(own, robot(), (brick(),), states=2)
-        found = tried.call_args.args[3].joint_pos
-        assert_allclose(found, own.joint_pos[[1, 2]])
+        start = tried.call_args.args[3]
+        assert_allclose(start.joint_pos, own.joint_pos[[1, 2]])
+        self.assertLess(start.joint_target[0, jaw], 0.005, "two fingertips press with 20 N")
 
     def test_the_origin_of_a_mesh_may_be_anywhere(self):
         """This one moves by centimeters where the brick turns a little in the hand."""

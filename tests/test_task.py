@@ -1277,8 +1277,8 @@ class ObservationTest(TestCase):
         x = replace(self.x, points=points)
         now = quat_rotate(self.x.observed_quat[2], points[2, 7]) + self.x.observed_pos[2]
         goal = quat_rotate(self.x.goal_quat[2], points[2, 7]) + self.x.goal_pos[2]
-        palm, frame = self.x.links.pos[2, 0], self.x.links.quat[2, 0]
-        of_palm = quat_rotate(quat_conjugate(frame), now - palm)
+        to_palm = quat_conjugate(self.x.links.quat[2, 0])
+        of_palm = quat_rotate(to_palm, now - self.x.links.pos[2, 0])
         near = 5.0 * torch.cat((now, of_palm, goal - now))
         for name, parameters, expected in (
             ("cloud", {"frames": 3, "scale": 1.0}, now),

@@ -1375,7 +1375,7 @@ class PolicyTest(TestCase):
     def test_refusals_name_what_differs(self):
         layout = policy_contract(self.robot, self.TASK, ()).observation_layout
         tactile = layout | {"policy": layout["policy"] | {"tactile": 4}}
-        robot = "a policy of the robot 'openarm', not of 'toy': use 'openarm', or another policy"
+        robot = "is a policy of the robot 'openarm', not of 'toy'. Give a policy of 'toy'"
         first, second, *_, last = self.robot.joint_names
         order = f"joint order .joint_names.0.: '{last}', here '{first}'; .*, here '{second}'.*; and . more"
         schema = "schema is 'xreset-policy/9', expected one of 'xreset-policy/1'"

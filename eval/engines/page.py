@@ -25,13 +25,12 @@ def page(found: Json) -> str:
         runs[column] = run
         for check in run["checks"]:
             checks.setdefault(check["check"], {})[column] = check
-    own = sorted(set().union(*(run["capabilities"] for run in runs.values())))
     return render(
         "engines.md.j2",
         found=found,
         runs=runs,
         checks=checks,
-        names=dict.fromkeys((*get_args(Capability), *own)),
+        names=get_args(Capability),
         verdict=_verdict,
         amount=_amount,
     )

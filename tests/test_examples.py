@@ -36,6 +36,7 @@ class FaceTest(TestCase):
     def test_every_name_is_there_and_documented(self):
         for name in xreset.__all__:
             self.assertTrue(getattr(xreset, name).__doc__, name)
+        self.assertEqual({*dir(xreset)}, {*xreset.__all__, "__version__"})
         with self.assertRaises(AttributeError):
             xreset.no_such_name  # noqa: B018
 

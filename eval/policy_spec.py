@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from xreset.errors import PolicyError
 from xreset.files.checks import Checked, Seed, frozen, obeys_rules
-from xreset.files.text import Brief, shown
+from xreset.files.text import quantity, shown
 from xreset.geometry.description import load_robot
 from xreset.learning.exported import PolicyFile, find_policy
 from xreset.live.deploy import check_made_for, deployed_graph, is_deployed, training_of
@@ -40,7 +40,7 @@ DEFAULT = "many-objects"
 
 
 @frozen
-class PolicySpec(Brief, Checked):
+class PolicySpec(Checked):
     """A policy, the robot and the task that it was trained for, and where its results go."""
 
     name: str
@@ -65,6 +65,12 @@ class PolicySpec(Brief, Checked):
             raise PolicyError(f"folder is {shown(self.folder)}, expected a path.")
         object.__setattr__(self, "folder", Path(self.folder))
         super().__post_init__()
+
+    def __repr__(self) -> str:
+        trained = "baseline" if self.objects is None else quantity(len(self.objects), "object")
+        return (
+            f"PolicySpec({self.name!r}, {self.robot.name!r}, {trained}, results in {self.folder})"
+        )
 
     @property
     def follows_motion(self) -> bool:

@@ -91,6 +91,8 @@ class Archive(InFolder):
             self.assert_same(again, demos)
             write_demos(file, again, config={"seed": 1})
             self.assertEqual(file.read_bytes(), written)
+        words = f"Demos(4 sequences, {rich.num_frames} frames, 2 objects)"
+        self.assertEqual(repr(read_demos(file)), words)
 
     def test_bad_values_name_sequence_and_frame(self):
         begin = self.demos.frames(1).start

@@ -156,10 +156,8 @@ class ShippedTest(WithPolicy):
     def test_a_name_means_the_shipped_file(self):
         self.assertEqual(list(shipped.shipped()), ["skilled"])
         subject = load_policy("skilled")
-        self.assertEqual(
-            (subject.name, subject.robot.name, subject.folder),
-            ("skilled", "openarm", Path("runs/skilled/eval")),
-        )
+        words = "PolicySpec('skilled', 'openarm', 1 object, results in runs/skilled/eval)"
+        self.assertEqual(repr(subject), words)
         self.assertEqual(subject.task, TASK)
         self.assertEqual(subject.hash, load_policy(self.file).hash)
 

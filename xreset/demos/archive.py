@@ -29,7 +29,7 @@ from xreset.files.records import (
     record_problem,
     write_record,
 )
-from xreset.files.text import Brief, shown, texts
+from xreset.files.text import Brief, quantity, shown, texts
 from xreset.geometry.shapes import quat_of, turn_of
 from xreset.objects.catalogue import canonical_names, load_object, object_names, official_name
 from xreset.objects.rest import rest_height
@@ -68,6 +68,12 @@ class ObjectMotions(Brief):
     frame_offsets: np.ndarray
     object_pos: np.ndarray
     object_quat_wxyz: np.ndarray
+
+    def __repr__(self) -> str:
+        sequences = quantity(len(self.sequence_name), "sequence")
+        frames = quantity(len(self.object_pos), "frame")
+        objects = quantity(len(self.object_names), "object")
+        return f"{type(self).__name__}({sequences}, {frames}, {objects})"
 
     @property
     def object_names(self) -> tuple[str, ...]:

@@ -45,14 +45,11 @@ def quantity(count: int, noun: str) -> str:
 
 
 class Brief:
-    """Base of dataclasses made with ``repr=False``, which print arrays as their shapes, no functions and no bytes, and
-    other values shortened."""
+    """Base of dataclasses made with ``repr=False``, which print arrays as their shapes, and other values shortened."""
 
     def __repr__(self) -> str:
         parts = []
         for name, value in vars(self).items():
-            if callable(value) or isinstance(value, bytes):
-                continue
             shape = getattr(value, "shape", None)
             parts.append(f"{name}={shown(value) if shape is None else f'array{list(shape)}'}")
         return f"{type(self).__name__}({', '.join(parts)})"

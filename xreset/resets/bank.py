@@ -34,7 +34,7 @@ from xreset.files.records import (
     unique_problem,
     write_record,
 )
-from xreset.files.text import Brief, shown
+from xreset.files.text import Brief, quantity, shown
 from xreset.retarget.accounts import Account, accounts
 from xreset.retarget.file import JointNames, ReasonNames
 from xreset.spec import ObjectSpec, RobotSpec, check_robot, first_difference
@@ -114,6 +114,12 @@ class ResetBank(Brief):
     transferred: Annotated[np.ndarray, Field(("L",), "b")] | None = None
     """[L] bool: whether the hand has a grasp of another demonstration, which holds the object at full weight in all
     ``engines`` (:func:`xreset.resets.transfer.add_transfers`); None: no state has (:attr:`own_grasp`)."""
+
+    def __repr__(self) -> str:
+        states = quantity(self.num_states, "state")
+        sequences = quantity(len(self.sequence_name), "sequence")
+        objects = quantity(len(self.object_names), "object")
+        return f"{type(self).__name__}({self.robot!r}, {states}, {sequences}, {objects})"
 
     @property
     def num_states(self) -> int:

@@ -134,17 +134,20 @@ class FilterTest(TestCase):
         self.assertEqual(accounts[-1].lost, {"object linear velocity": 1})
 
     def test_a_state_with_the_robot_deep_in_the_object_is_not_tried(self):
-        motion = self.retargeted()
+        """The demonstration that loses its frames after contact, one for the depth and one in retargeting, is doubted."""
+        reason = np.array([0, 0, 1, 0, 0, 0])
+        first = np.array([1, 0])
+        motion = self.retargeted(first_contact=first, valid=reason == 0, reason=reason)
         pos = motion.object_pos.copy()
-        pos[1] = (
-            Kinematics(self.robot)
-            .points(torch.as_tensor(self.robot.home), [self.robot.palm])[0]
-            .numpy()
-        )
-        pressed = replace(motion, object_pos=pos)
-        bank = make_bank(pressed, self.robot, self.objects, **ONLY_FRAMES)
+        palm = Kinematics(self.robot).points(torch.as_tensor(self.robot.home), [self.robot.palm])
+        pos[1] = palm[0].numpy()
+        pressed = replace(motion, object_pos=pos, reason_names=("valid", "object collision"))
+        notes = []
+        bank = make_bank(pressed, self.robot, self.objects, note=notes.append, **ONLY_FRAMES)
         self.assertEqual(reasons(bank), ["object collision"])
         self.assertEqual(bank.object_depth.tolist(), [0.0] * 4)
+        words = "^1 of 2 demon.* kept 0 of 2, .* 'object collision': xreset view FILE --sequence 0$"
+        self.assertRegex("".join(notes), words)
 
     def tried(self, verdicts, **options):
         """The bank, and the objects, states and steps of each try; ``verdicts`` are the reasons that each try gives."""

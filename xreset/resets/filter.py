@@ -16,6 +16,7 @@ import torch
 
 from xreset.errors import DemoError
 from xreset.files.progress import Progress
+from xreset.files.text import quantity
 from xreset.geometry.collision import object_depth
 from xreset.physics import State
 from xreset.resets.bank import ResetBank, starts_and_goals
@@ -23,17 +24,15 @@ from xreset.resets.closing import closing_states
 from xreset.resets.config import ClosingConfig, FilterConfig
 from xreset.resets.fingers import fingers_of, grip_forces, squeeze_targets
 from xreset.resets.probe import REASONS, rejection, rejections
+from xreset.retarget.accounts import accounts
 from xreset.retarget.file import Retargeted
 from xreset.retarget.validity import Thresholds
-from xreset.spec import (
-    ObjectSpec,
-    RobotSpec,
-    SceneSpec,
-    objects_named,
-)
+from xreset.spec import ObjectSpec, RobotSpec, SceneSpec, objects_named
 
 _SHARES = (1.0, 0.5, 0.25)
 """Shares of the force with which fingers try to press, one after the other, until the object stays where it is."""
+_FEW = 0.1
+"""A demonstration that keeps a smaller share of its frames after contact is doubted."""
 
 
 def stable_states(
@@ -118,4 +117,29 @@ def stable_states(
         reason_names=REASONS,
         **kept,
         **rejected,
+    )
+
+
+def doubt_about_losses(bank: ResetBank, motion: Retargeted, file: str) -> str:
+    """Return a doubt about demonstrations that lost almost all frames after contact, or nothing; ``file``: motion to
+    look at."""
+    reason = np.asarray(motion.reason_names, dtype=object)[motion.reason]
+    reason[motion.valid] = ""
+    frame = motion.frame_offsets[bank.rejected_sequence_index] + bank.rejected_frame_index
+    rejected = np.asarray(bank.reason_names, dtype=object)[bank.rejected_reason]
+    if bank.rejected_frame_part is not None:
+        is_frame = bank.rejected_frame_part == 0
+        frame = frame[is_frame]
+        rejected = rejected[is_frame]
+    reason[frame] = rejected
+    numbers = motion.sequence_of_frame.astype(str)
+    rows = [row.without("not annotated") for row in accounts(numbers, motion.post_contact, reason)]
+    few = [r for r in rows[:-3] if r.phase == "post-contact" and r.kept < _FEW * r.total]
+    if not few:
+        return ""
+    worst = min(few, key=lambda row: row.kept / row.total)
+    return (
+        f"{len(few)} of {quantity(len(motion.sequence_name), 'demonstration')} kept less than {_FEW:.0%} of the frames "
+        f"after contact; the worst kept {worst.kept} of {worst.total}, mostly because of {next(iter(worst.lost))!r}: "
+        f"xreset view {file} --sequence {worst.object_name}"
     )

@@ -72,7 +72,7 @@ def make_bank(
         transfer: extra states at poses of each demonstration, in grasps of other demonstrations of the same object
             that hold its full weight in every engine. There are none if no finger presses.
         progress: called with (what is tried, candidates tried, candidates in all).
-        note: called with the doubts that the motion states about its demonstrations.
+        note: called with the doubts that the motion states about its demonstrations, and with that of few kept frames.
 
     Raises:
         DemoError: no frame is valid, or an object of the motion is not given.
@@ -81,7 +81,7 @@ def make_bank(
     """
     from xreset.files.records import stated_doubts
     from xreset.resets.bank import write_bank
-    from xreset.resets.filter import stable_states
+    from xreset.resets.filter import doubt_about_losses, stable_states
     from xreset.resets.inputs import load_inputs
     from xreset.resets.transfer import add_transfers
     from xreset.retarget.file import Retargeted
@@ -120,6 +120,9 @@ def make_bank(
         device=device,
         progress=partial(progress, f"states stable in {', '.join(engines)}"),
     )
+    if doubt := doubt_about_losses(bank, motion, str(inputs.path or "FILE")):
+        doubts.append(doubt)
+        note(doubt)
     if transfer.per_pose and force:
         bank = add_transfers(
             bank,

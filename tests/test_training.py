@@ -515,6 +515,7 @@ class TrainingTest(WithBank):
         words = f"at iteration 0: privileged, reward. Do .* finite numbers \\({name}\\)"
         with self.assertRaisesRegex(RunError, words):
             self.train("not_a_number", config=replace(CONFIG, task=task))
+        self.assertFalse((self.folder / "not_a_number").exists())
 
     def test_a_run_folder_does_not_decide_which_code_is_imported(self):
         """Reward terms of one's own are taken from the command line only."""
@@ -845,11 +846,16 @@ class TrainingTest(WithBank):
 
     def test_a_run_without_a_checkpoint_starts_again(self):
         """Killed before the first one: whether the same command is given again or only its folder, and whatever is left of the first."""
+
+        def killed(runner, *total, minutes):
+            runner.iteration = 1
+            raise ZeroDivisionError
+
         for is_resumed in (True, False):
             with self.subTest(is_resumed=is_resumed):
                 name = f"early-{is_resumed}"
                 with (
-                    patch.object(TrainingRunner, "learn", side_effect=ZeroDivisionError),
+                    patch.object(TrainingRunner, "learn", killed),
                     self.assertRaises(ZeroDivisionError),
                 ):
                     self.train(name)

@@ -316,17 +316,23 @@ def _claimed(out: Path) -> Iterator[None]:
 
 @contextmanager
 def new_run(out: Path) -> Iterator[None]:
-    """Like :func:`_claimed`; leave nothing new in the folder if the run does not get its ``run.json``."""
-    written = (out / TEACHER, out / "goals.npz", out / "resets.npz", out / "checkpoints", out)
-    new = [path for path in written if not path.exists()]
+    """Like :func:`_claimed`; leave nothing new in the folder if the run ends without its ``run.json``."""
+
+    def written() -> list[Path]:
+        curves = out.glob("events.out.tfevents.*")
+        data = (out / TEACHER, out / "goals.npz", out / "resets.npz")
+        return [*curves, *data, out / "checkpoints", out]
+
+    before = [path for path in written() if path.exists()]
     with _claimed(out):
         try:
             yield
         finally:
             if Processes.of_environment().is_main and not (out / "run.json").exists():
-                for path in new:
-                    with suppress(OSError):  # not written yet, or a folder with other files
-                        path.rmdir() if path.is_dir() else path.unlink()
+                for path in written():
+                    if path not in before:
+                        with suppress(OSError):  # not written yet, or a folder with other files
+                            path.rmdir() if path.is_dir() else path.unlink()
 
 
 _MANY_ON_A_CPU = 256
@@ -445,7 +451,13 @@ def run_training(
             runner.alg.networks["actor"].trunk.normalizer.until = 0
         if processes.is_main:
             _write_start(out, info, runner.iteration, is_new=newest is None, resumed=resumed)
-        stopped_by = runner.learn(info.total, minutes=info.minutes)
+        try:
+            stopped_by = runner.learn(info.total, minutes=info.minutes)
+        except BaseException:
+            # such as a mistake in a reward term; the corrected command is then a new training
+            if processes.is_main and not (resumed or runner.iteration):
+                (out / "run.json").unlink()
+            raise
     if processes.is_main:
         policy = out / "policy.onnx"
         export_checkpoint(latest_checkpoint(out), policy)

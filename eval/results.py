@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Sequence
 from dataclasses import MISSING, asdict, field, fields, make_dataclass
 from functools import cache, cached_property
@@ -32,7 +31,7 @@ from xreset.files.checks import (
     renamed,
 )
 from xreset.files.records import POSITION, UNIT_TOLERANCE, Field, read_npz, write_npz
-from xreset.files.storage import check_schema, read_json, write_json
+from xreset.files.storage import check_schema, matches, read_json, write_json
 from xreset.files.text import Brief, shown
 from xreset.spec import first_difference
 
@@ -353,9 +352,7 @@ def read_evaluation(folder: Path) -> Evaluation:
     Raises:
         FileFormatError: a file is damaged, or the files are of different evaluations.
     """
-    files = []
-    if os.path.isdir(folder):
-        files = [f for f in folder.glob("*.json") if not f.name.endswith(".episodes.json")]
+    files = [f for f in matches(folder, "*.json") if not f.name.endswith(".episodes.json")]
     found = Evaluation(map(read_result, sorted(files, key=lambda f: f.stem)))
     found.folder = folder
     return found
@@ -363,7 +360,7 @@ def read_evaluation(folder: Path) -> Evaluation:
 
 def has_results(folder: Path) -> bool:
     """Return whether a folder has results of an engine."""
-    return any(folder.glob("*.json"))
+    return bool(matches(folder, "*.json"))
 
 
 def read_result(path: Path) -> EvalResult:

@@ -16,7 +16,9 @@ from scipy.spatial import ConvexHull, cKDTree
 
 from tests.command import refused, succeeds
 from tests.data import InFolder, data_dir, refuses
+from xreset.demos.dexycb import read_dexycb
 from xreset.errors import ObjectError, XResetError
+from xreset.eval.results import read_evaluation
 from xreset.geometry.shapes import (
     half_spaces,
     hull,
@@ -25,6 +27,7 @@ from xreset.geometry.shapes import (
     turn_of,
     winding_number,
 )
+from xreset.learning.run import read_run
 from xreset.objects.catalogue import (
     canonical_name,
     canonical_names,
@@ -489,6 +492,13 @@ class MeshImport(InFolder):
         (self.folder / "mug.STL").touch()
         with self.assertRaisesRegex(ObjectError, "no mesh in .* xreset objects import MESH --out"):
             mesh_files(self.folder)
+        denied = patch("os.scandir", side_effect=PermissionError(13, "Permission denied"))
+        for read in (mesh_files, read_dexycb, read_run, read_evaluation):
+            with (
+                denied,
+                refuses(self, "Cannot read the folder .*: Permission denied", XResetError, read),
+            ):
+                read(self.folder)
         self.write(CUBE, "011_banana")
         for name in ("025_mug/textured", "025_mug/textured_simple", "024_bowl/textured"):
             path = self.folder / f"{name}.obj"

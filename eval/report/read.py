@@ -25,7 +25,7 @@ from xreset.eval.results import (
 )
 from xreset.eval.stats import Table
 from xreset.files.checks import frozen, renamed
-from xreset.files.storage import file_hash, read_json
+from xreset.files.storage import file_hash, matches, read_json
 from xreset.files.text import Brief, short_name, shown
 from xreset.geometry.description import load_robot
 from xreset.learning.clock import Lift, read_lift
@@ -154,7 +154,7 @@ def read_curves(folder: Path) -> Table:
         XResetError: there are event files, and TensorBoard, which reads them, cannot be imported.
     """
     files = []
-    for file in sorted(folder.glob("events.out.tfevents.*")):
+    for file in matches(folder, "events.out.tfevents.*"):
         if found := list(_scalars(file)):
             files.append(found)
     # By where each begins, as a resumed run begins later: the names hold a clock, which may have run back.
@@ -321,7 +321,7 @@ def _sweep(folder: Path, policies: set[str | None], notes: list[str]) -> Evaluat
     """Return the results of ``xreset stress`` in a folder that are of the same policy. Those of 0.1 to 0.3, which had
     no episodes, are left out, with a note."""
     found = Evaluation()
-    for file in sorted(folder.glob("*.json")):
+    for file in matches(folder, "*.json"):
         if file.name.endswith(".episodes.json"):
             continue
         schema = read_json(file).get("schema")

@@ -26,6 +26,7 @@ from xreset.errors import DemoError, FileFormatError
 from xreset.files.checks import is_rigid
 from xreset.files.progress import Progress, unseen
 from xreset.files.records import Field, read_npz
+from xreset.files.storage import matches
 from xreset.files.text import shown
 from xreset.geometry.shapes import transformed
 from xreset.objects.ycb import NAME_OF_ID
@@ -48,7 +49,7 @@ def read_dexycb(root: str | Path, *, progress: Progress = unseen) -> Demos:
         DemoError: the folder is not in DexYCB's layout, or parts of a sequence are missing or contradict each other.
     """
     root = Path(root)
-    found = sorted(root.glob("*/*/meta.yml"))
+    found = matches(root, "*/*/meta.yml")
     if not found:
         raise DemoError(
             f"There is no DexYCB sequence in {root}: expected SUBJECT/SEQUENCE/meta.yml below it, such as"

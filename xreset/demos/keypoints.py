@@ -27,7 +27,7 @@ from xreset.demos.hand import ORDERS, Order
 from xreset.errors import DemoError
 from xreset.files.checks import frozen, is_rigid
 from xreset.files.records import POSITION, RATE, UNIT_TOLERANCE, Arrays, Field, read_npz
-from xreset.files.storage import max_bytes, must_exist
+from xreset.files.storage import matches, max_bytes, must_exist
 from xreset.files.text import is_plain, shown
 from xreset.geometry.shapes import transformed
 from xreset.objects.catalogue import official_name
@@ -116,7 +116,7 @@ def read_keypoints(
         folder = path
         files = [
             file
-            for file in sorted(path.rglob("*"))
+            for file in matches(path, "**/*")
             if file.suffix.lower() in (".npz", ".csv")
             and file.is_file()
             and not file.name.startswith(".")

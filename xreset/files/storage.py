@@ -75,6 +75,23 @@ def write_whole(path: str | Path, content: bytes | memoryview | str) -> None:
         file.write(content.encode() if isinstance(content, str) else content)
 
 
+def matches(folder: Path, pattern: str) -> list[Path]:
+    """Return the paths in a folder that match a pattern, sorted; none if there is no such folder.
+
+    Raises:
+        XResetError: the folder cannot be read; for ``Path.glob`` it is empty.
+    """
+    if not os.path.isdir(folder):
+        return []
+    try:
+        os.scandir(os.path.join(folder, ".")).close()
+    except PermissionError as error:
+        raise XResetError(
+            f"Cannot read the folder {folder}: {error.strerror}. Change its permissions, or give another."
+        ) from error
+    return sorted(folder.glob(pattern))
+
+
 def must_be_new(path: Path) -> None:
     """Refuse, with ``XResetError``, a folder with content, or a file, where a folder will be made."""
     if path.exists() and (not path.is_dir() or any(path.iterdir())):

@@ -25,7 +25,7 @@ from xreset.files.checks import (
     from_dict,
     frozen,
 )
-from xreset.files.storage import read_json, stated_path, write_json
+from xreset.files.storage import matches, read_json, stated_path, write_json
 from xreset.files.text import shown
 from xreset.learning.clock import Lift, read_lift
 from xreset.learning.config import TrainConfig
@@ -118,7 +118,7 @@ def read_run(folder: str | Path, *, as_stated: bool = False) -> RunInfo:
     folder = Path(folder)
     if os.path.isfile(folder):
         raise RunError(f"{folder} is a file. Give the folder of its run, which has a run.json.")
-    if not os.path.isfile(folder / "run.json"):
+    if not matches(folder, "run.json"):
         to_do = f"Make one with: xreset train --out {folder} ..."
         if os.path.isfile(folder.parent / "run.json"):
             to_do = f"The folder above has one: give {folder.parent}."
@@ -168,7 +168,7 @@ def differences(
 
 def checkpoints(folder: Path) -> list[Path]:
     """Return the checkpoints, oldest first."""
-    return sorted((folder / "checkpoints").glob("[0-9]*.pt"))
+    return matches(folder / "checkpoints", "[0-9]*.pt")
 
 
 def latest_checkpoint(folder: Path) -> Path:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from xreset.errors import ObjectError
 from xreset.files.checks import first_repeated
+from xreset.files.storage import matches
 from xreset.files.text import short_name, shown
 from xreset.objects.meshes import import_mesh, mesh_source
 from xreset.objects.properties import properties_of
@@ -43,10 +44,10 @@ def mesh_files(folder: str | Path) -> dict[str, Path]:
         raise ObjectError(f"{folder} is a file, not a folder of meshes. {expected}")
     if not os.path.isdir(folder):
         raise ObjectError(f"There is no folder {shown(str(folder))}. {expected}")
-    found = {path.stem: path for path in folder.glob("[!.]*.[oO][bB][jJ]")}
+    found = {path.stem: path for path in matches(folder, "[!.]*.[oO][bB][jJ]")}
     nested = {}
     for file in ("textured.obj", "textured_simple.obj"):  # the simpler one wins
-        nested |= {path.parent.name: path for path in folder.glob(f"*/{file}")}
+        nested |= {path.parent.name: path for path in matches(folder, f"*/{file}")}
     for name in found.keys() & nested.keys():
         raise ObjectError(
             f"{found[name]} and {nested[name]} have the same name. Remove one of them."

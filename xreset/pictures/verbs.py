@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -168,7 +169,8 @@ def import_objects(
         mass: mass in kg.
         friction: friction coefficient: the middle of the range that training and evaluation draw from.
         picture: PNG to write: the meshes next to their pieces, with the deviation in millimetres.
-        progress: called with (the mesh that is cut, meshes done, meshes in all).
+        progress: called with (the mesh that is cut, meshes done, with the share of this one's largest effort, meshes in
+            all).
 
     Raises:
         ObjectError: a mesh cannot be used, or options do not fit together.
@@ -209,12 +211,13 @@ def import_objects(
         files = {name or path.stem: path}
     found = []
     for object_name, file in files.items():
-        progress(f"{object_name} ({file})", len(found), len(files))
+        moved = partial(_move, progress, f"{object_name} ({file})", len(found), len(files))
+        moved(0.0)
         if out is None:
-            result = meshes.import_with_notes(file, object_name)
+            result = meshes.import_with_notes(file, object_name, moved)
         else:
             result = meshes.add_mesh(
-                file, Path(out), object_name, scale=scale, properties=properties
+                file, Path(out), object_name, scale=scale, properties=properties, progress=moved
             )
         found.append(result)
     if picture is not None:
@@ -226,3 +229,7 @@ def import_objects(
         objects = [result.obj for result in found]
         render.write_png(Path(picture), pieces.draw_pieces(objects, captions))
     return found
+
+
+def _move(progress: NamedProgress, mesh: str, done: int, total: int, share: float) -> None:
+    progress(mesh, done + share, total)

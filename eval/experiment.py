@@ -5,9 +5,9 @@
 
 from __future__ import annotations
 
-import logging
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -36,7 +36,7 @@ def play(
     trial: Trial,
     engines: Sequence[Engine],
     conditions: Sequence[Condition],
-    folder: Path,
+    folder: Path | None,
     *,
     episodes: int,
     on_robot: bool = False,
@@ -50,7 +50,7 @@ def play(
         trial: what is played; conditions replace its task.
         engines: the engines. Each leaves out the properties that it cannot set.
         conditions: the first one, in which nothing is changed, is recorded.
-        folder: where the results are written.
+        folder: where the results are written; None: nowhere.
         episodes: episodes of each demonstration, each with another perturbation, the same under every condition.
         on_robot: whether a robot's control loop plays, as faults need.
         progress: called with the engine, what is done and what is to be done in all; for one condition control steps,
@@ -58,9 +58,10 @@ def play(
     """
     found = Evaluation()
     found.folder = folder
-    with claim_folder(folder):
+    with claim_folder(folder) if folder else nullcontext():
         for engine in engines:
-            _warn_of_replaced(folder / f"{engine.name}.json", policy, trial)
+            if folder:
+                _refuse_to_replace(folder / f"{engine.name}.json", policy, trial)
         for engine in engines:
             result, traces = _play_in(
                 engine,
@@ -71,7 +72,8 @@ def play(
                 on_robot=on_robot,
                 progress=partial(progress, engine.name),
             )
-            write_result(folder, result, traces, trial.robot.joint_names)
+            if folder:
+                write_result(folder, result, traces, trial.robot.joint_names)
             found.append(result)
     return found
 
@@ -169,25 +171,21 @@ def _length(trial: Trial) -> float:
     return float(trial.task.termination.episode_seconds)  # JSON has no numbers of NumPy
 
 
-def _warn_of_replaced(file: Path, policy: PolicySpec, trial: Trial) -> None:
-    """Warn, before any episode, of results that will be replaced although they are of another policy, of other
-    demonstrations or of episodes of another length. A policy that was trained on has the same name."""
+def _refuse_to_replace(file: Path, policy: PolicySpec, trial: Trial) -> None:
+    """Raise ``XResetError`` if a file has results of another policy, of other demonstrations or of episodes of another
+    length. A policy that was trained on has the same name."""
     try:
         known = read_result(file)
     except XResetError:  # the file does not exist, or is damaged
         return
     what = ""
-    is_same_file = policy.hash is not None and known.inputs.get("policy") == policy.hash
-    if known.policy != policy.name and not is_same_file:
+    if known.policy != policy.name and policy.hash not in known.inputs.values():
         what = f"another policy, {known.policy}"
     elif known.inputs.get("demos") != trial.inputs.get("demos"):
         what = "other demonstrations"
     elif known.episode_seconds not in (None, _length(trial)):
         what = "episodes of another length"
     if what:
-        logging.getLogger(__name__).warning(
-            "%s: results of %s, which this evaluation replaces. To keep them, stop it now and choose another folder "
-            "(--out; in Python: out).",
-            file,
-            what,
+        raise XResetError(
+            f"{file} has results of {what}. Choose another folder (--out; in Python: out), or remove the file."
         )

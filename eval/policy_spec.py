@@ -61,9 +61,8 @@ class PolicySpec(Checked):
     """Content of the exported policy's file; None: a baseline."""
 
     def __post_init__(self) -> None:
-        if not isinstance(self.folder, str | Path):
-            raise PolicyError(f"folder is {shown(self.folder)}, expected a path.")
-        object.__setattr__(self, "folder", Path(self.folder))
+        if isinstance(self.folder, str):
+            object.__setattr__(self, "folder", Path(self.folder))
         super().__post_init__()
 
     def __repr__(self) -> str:

@@ -76,17 +76,17 @@ def evaluate(
         seed: seed of the perturbations, which are the same in every engine.
         device: where engines run that can use a GPU: cpu or cuda.
         num_envs: worlds that run at the same time.
-        out: folder for the results; default: eval/ in the run folder or next to the policy, runs/NAME/eval for a policy
-            that ships with xreset, runs/BASELINE-ROBOT/eval for a baseline.
+        out: folder for the results and recorded episodes; the command's default: eval/ in the run folder or next to the
+            policy, runs/NAME/eval for a policy that ships with xreset, runs/BASELINE-ROBOT/eval for a baseline.
         progress: called with (engine, control steps done, control steps in all).
 
     Returns:
-        The results that were written, in the order of the engines. They print as a table; ``to_frame()`` has a row for
-        each episode.
+        The results, in the order of the engines. They print as a table; ``to_frame()`` has a row for each episode.
 
     Raises:
         PolicyError: the policy is unknown.
-        XResetError: another process is writing the folder, or a number is out of range.
+        XResetError: another process is writing the folder, the folder has results of another policy or of other
+            episodes, or a number is out of range.
     """
     from xreset.eval import experiment
     from xreset.eval.policy_spec import load_policy
@@ -107,7 +107,7 @@ def evaluate(
         trial,
         chosen,
         [Condition(task=trial.task)],
-        Path(out) if out else spec.folder,
+        Path(out) if out else None,
         episodes=episodes,
         progress=progress,
     )

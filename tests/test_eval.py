@@ -2,8 +2,11 @@
 
 import json
 import math
+import os
 import re
+from contextlib import chdir
 from dataclasses import replace
+from pathlib import Path
 from unittest import TestCase
 from unittest.mock import patch
 
@@ -18,6 +21,7 @@ from torch import tensor
 from torch.testing import assert_close
 
 from tests import toy_grasp
+from tests.command import succeeds
 from tests.data import InFolder, refuses
 from tests.toy_bank import SOUP, SPAM, toy_bank, toy_retargeted
 from tests.toy_results import OBJECTS, toy_result, toy_rollouts
@@ -408,7 +412,7 @@ class ResultsTest(InFolder):
         self.rollouts = toy_rollouts()
         for name in ("sapien", "mujoco"):
             write_result(self.folder, toy_result(name), self.rollouts.traces, JOINTS)
-        self.policy = replace(toy_grasp.policy(), folder=self.folder)
+        self.policy = toy_grasp.policy()
 
     def test_the_table_tells_trained_objects_from_unseen_ones(self):
         result = toy_result(unseen=(OBJECTS[1],))
@@ -561,7 +565,7 @@ class ResultsTest(InFolder):
         for changes, words in (
             ({"robot": "openarm"}, "robot is 'openarm', expected RobotSpec"),
             ({"task": None}, "task is None, expected TaskConfig"),
-            ({"folder": None}, "folder is None, expected a path"),
+            ({"folder": None}, "folder is None, expected Path"),
         ):
             with refuses(self, words, XResetError):
                 replace(mine, **changes)
@@ -572,8 +576,8 @@ class ResultsTest(InFolder):
             patch("xreset.eval.rollout.chosen_engines", return_value=[]),
         ):
             with claim_folder(self.folder), self.assertRaisesRegex(XResetError, "writing"):
-                evaluate(self.policy, "demos.npz")
-            self.assertEqual(evaluate(self.policy, "demos.npz"), [])
+                evaluate(self.policy, "demos.npz", out=self.folder)
+            self.assertEqual(evaluate(self.policy, "demos.npz", out=self.folder), [])
 
     def test_engines_of_one_name_and_another_robot_are_refused(self):
         alike = [engine("mujoco", workers=0), "mujoco"]
@@ -591,25 +595,35 @@ class ResultsTest(InFolder):
         bank = toy_bank(policy.robot)
         found = {}
         for seconds in (0.1, np.float32(0.25)):
+            out = self.folder / str(seconds)
             (result,) = evaluate(
                 policy,
                 bank,
                 engine("mujoco", workers=0),
                 episodes=1,
                 episode_seconds=seconds,
-                out=self.folder,
+                out=out,
             )
             self.assertEqual(result.episode_seconds, seconds)
             self.assertIn(
                 f"episodes: 3 of {seconds} s, demonstrations: 3", repr(Evaluation([result]))
             )
-            self.assertEqual(read_evaluation(self.folder)[0], result)
-            found[seconds] = read_traces(self.folder, "mujoco", policy.robot.joint_names)
+            self.assertEqual(read_evaluation(out), [result])
+            found[seconds] = read_traces(out, "mujoco", policy.robot.joint_names)
         for short, long in zip(found[0.1], found[0.25], strict=True):
             self.assertEqual([len(short.joint_target), len(long.joint_target)], [6, 15])
             assert_array_equal(long.object_pos[: len(short.time)], short.object_pos)
         trained = load_trial(policy, bank).task.termination.episode_seconds
         self.assertEqual(trained, policy.task.termination.episode_seconds)
+
+    def test_the_command_has_a_default_folder_and_the_function_has_none(self):
+        with chdir(self.folder):
+            write_demos("demos.npz", synthesize([SOUP], 1))
+            made = evaluate("zero", "demos.npz", robot="openarm", episode_seconds=0.1)
+            self.assertFalse(os.path.exists("runs"))
+            succeeds("eval zero --robot openarm --demos demos.npz --episode-seconds 0.1")
+            (found,) = read_evaluation(Path("runs/zero-openarm/eval"))
+            assert_frame_equal(found.episodes, made[0].episodes)
 
     def test_starts_and_goals_that_are_in_no_file_are_told_apart(self):
         """Reports compare results only if they are of the same ones."""
@@ -635,9 +649,10 @@ class ResultsTest(InFolder):
         """Usually three control steps lie between two states; these episodes have one other state."""
         policy = load_policy("zero", robot="ur7e-sharpa")
         for steps in (1, 5):
-            options = {"episodes": 1, "episode_seconds": steps / 59, "out": self.folder}
+            out = self.folder / str(steps)
+            options = {"episodes": 1, "episode_seconds": steps / 59, "out": out}
             evaluate(policy, toy_bank(policy.robot), engine("mujoco", workers=0), **options)
-            for trace in read_traces(self.folder, "mujoco", policy.robot.joint_names):
+            for trace in read_traces(out, "mujoco", policy.robot.joint_names):
                 assert_allclose(trace.time, (0.0, steps / 60), atol=1e-6)
                 self.assertEqual(trace.actions("it")[1], steps)
 
@@ -647,30 +662,26 @@ class ResultsTest(InFolder):
             with refuses(self, words, XResetError, seconds):
                 evaluate("zero", "demos.npz", robot="openarm", episode_seconds=seconds)
 
-    def test_results_of_other_episodes_are_named_before_they_are_replaced(self):
+    def test_results_of_other_episodes_are_not_replaced(self):
         file = self.folder / "mujoco.json"
+        choose = r". Choose another folder \(--out; in Python: out\), or remove the file."
         for name, demos, seconds, told in (
             (self.policy.name, "ab", 5.0, ""),
-            ("other", "ab", 5.0, f"{file}: results of another policy, other"),
-            (self.policy.name, "cd", 5.0, f"{file}: results of other demonstrations"),
-            (self.policy.name, "ab", 6.0, f"{file}: results of episodes of another length"),
+            ("other", "ab", 5.0, f"{file} has results of another policy, other{choose}"),
+            (self.policy.name, "cd", 5.0, f"{file} has results of other demonstrations"),
+            (self.policy.name, "ab", 6.0, f"{file} has results of episodes of another length"),
         ):
             write_result(self.folder, toy_result(policy=name, episode_seconds=5.0), (), ())
             before = file.read_bytes()
-            logged = self.assertLogs if told else self.assertNoLogs
             with (
                 self.subTest(told),
                 patch("xreset.eval.rollout.load_trial") as load_trial,
                 patch("xreset.eval.experiment.roll_out", side_effect=KeyboardInterrupt),
-                logged("xreset.eval.experiment") as logs,
-                self.assertRaises(KeyboardInterrupt),
+                self.assertRaisesRegex(XResetError if told else KeyboardInterrupt, told),
             ):
                 task = TaskConfig(termination=TerminationConfig(episode_seconds=seconds))
                 load_trial.return_value = toy_grasp.trial(task, inputs={"demos": demos})
-                evaluate(self.policy, "demos.npz", "mujoco")
-            if told:
-                self.assertIn(told, logs.output[0])
-                self.assertIn("choose another folder (--out; in Python: out).", logs.output[0])
+                evaluate(self.policy, "demos.npz", "mujoco", out=self.folder)
             self.assertEqual(file.read_bytes(), before)
 
     def test_a_result_that_is_not_a_number_is_not_written(self):

@@ -241,10 +241,10 @@ class TrainingTest(InOneFolder):
             ("openarm", "eval"),
             ("ur7e-robotiq", "ur7e-robotiq/eval"),
         ):
+            self.assertEqual(load_policy(self.out, robot=name).folder, self.out / folder)
             (result,) = self.evaluation(name)
             self.assertEqual(result.robot, name)
             self.assertEqual(len(result.episodes), 3)
-            self.assertTrue((self.out / folder / "mujoco.json").is_file())
         self.assertEqual(load_policy(self.out).robot.name, "openarm")
         with self.assertRaisesRegex(PolicyError, "'ur7e-sharpa' has 6 .* up to 5 .* 7 and 1"):
             load_policy(self.out, robot="ur7e-sharpa")

@@ -13,6 +13,15 @@ if TYPE_CHECKING:
     from xreset.eval.results import Evaluation
 
 
+def _write_into_default_folder(arguments: dict[str, Any]) -> None:
+    from xreset.eval.policy_spec import load_policy
+
+    if arguments["out"] is None:
+        policy = load_policy(arguments["policy"], robot=arguments["robot"])
+        arguments["policy"] = policy
+        arguments["out"] = policy.folder
+
+
 def _show(results: Evaluation, _options: Mapping[str, Any]) -> None:
     from xreset.eval import table
 
@@ -22,4 +31,4 @@ def _show(results: Evaluation, _options: Mapping[str, Any]) -> None:
     console.print(f"results in {results.folder}")
 
 
-COMMAND = verb(verbs.evaluate, _show)
+COMMAND = verb(verbs.evaluate, _show, prepare=_write_into_default_folder)

@@ -46,7 +46,7 @@ _warn = logging.getLogger(__name__).warning
 def evaluate(
     policy: str | Path | PolicySpec,
     demos: str | Path | Data,
-    engines: Annotated[str | Engine | Sequence[str | Engine], Option("engine")] = "mujoco",
+    engine: str | Engine | Sequence[str | Engine] = "mujoco",
     *,
     episodes: PositiveInt = 5,
     episode_seconds: float | None = None,
@@ -67,7 +67,7 @@ def evaluate(
             ships with xreset (xreset policies); or a baseline: zero, ik (open-loop kinematic retargeting).
         demos: starts and goals, and the path of ik: demonstrations (xreset demos), retargeted motion (xreset retarget)
             or a goal set (xreset goals).
-        engines: physics engine to play in; several are played from the same starts.
+        engine: physics engine to play in; several are played from the same starts.
         episodes: episodes of each demonstration, each with another perturbation of robot and object.
         episode_seconds: length of an episode [s], such as 12, as in the published paper; default: as in the policy's
             training.
@@ -93,7 +93,7 @@ def evaluate(
     from xreset.eval.rollout import chosen_engines, load_trial
 
     spec = load_policy(policy, robot=robot)
-    chosen = chosen_engines(engines, device)
+    chosen = chosen_engines(engine, device)
     trial = load_trial(
         spec,
         demos,
@@ -117,7 +117,7 @@ def evaluate(
 def stress(
     policy: str | Path | PolicySpec,
     demos: str | Path | Data | None = None,
-    engines: Annotated[str | Engine | Sequence[str | Engine], Option("engine")] = "mujoco",
+    engine: str | Engine | Sequence[str | Engine] = "mujoco",
     *,
     properties: Annotated[str | Sequence[str], Option("property")] = (),
     faults: bool = False,
@@ -140,7 +140,7 @@ def stress(
             xreset (xreset policies), or a baseline, which has no faults.
         demos: demonstrations whose starts and goals are played; default: two synthetic demonstrations of each of the
             policy's objects.
-        engines: physics engine to play in, or several.
+        engine: physics engine to play in, or several.
         properties: property or fault to change, or NAME=VALUE,VALUE... for values of your own (factors, s, m, rad; the
             table shows each unit). Default: all physical properties.
         faults: change the faults of a robot by default, in place of physics.
@@ -175,7 +175,7 @@ def stress(
     from xreset.eval.rollout import chosen_engines, load_trial
 
     spec = load_policy(policy, robot=robot)
-    chosen = chosen_engines(engines, device)
+    chosen = chosen_engines(engine, device)
     if on_robot:
         spec.exported()  # refuses a baseline
     if demos is None:
@@ -379,7 +379,7 @@ def export_episodes(
     folders: str | Path | Sequence[str | Path],
     out: Annotated[Output, replaces("xreset-rollouts/")],
     *,
-    engines: Annotated[str | Sequence[str], Option("engine")] = (),
+    engine: str | Sequence[str] = (),
     robot: str | Path | None = None,
     meshes: str | Path | None = None,
     task: str | None = None,
@@ -395,7 +395,7 @@ def export_episodes(
     Args:
         folders: run folders, or folders that xreset eval wrote into.
         out: folder of the data set, which must not exist or be empty; or a file FILE.npz of plain arrays.
-        engines: only episodes of this engine, or of several; default: all.
+        engine: only episodes of this engine, or of several; default: all.
         robot: name or folder of the robot; default: as the results name it.
         meshes: folder of meshes; default: as the results name it.
         task: the task in words; {object} is replaced by the object's name.
@@ -420,7 +420,7 @@ def export_episodes(
         raise XResetError(
             f"{out} cannot hold films of cameras. Omit the cameras, or name a folder."
         )
-    recording = read_recorded(folders, engines=engines, robot=robot, meshes=meshes, task=task)
+    recording = read_recorded(folders, engines=engine, robot=robot, meshes=meshes, task=task)
     if out.suffix == ".npz":
         write_arrays(out, recording)
     else:

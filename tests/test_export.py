@@ -179,11 +179,11 @@ class Arrays(Case):
             self.assertEqual(file["engine"].tolist(), ["sapien", "sapien"])
             self.assertEqual(file["task"][0], "Lift the tomato soup can.")
         again = self.folder / "again.npz"
-        xreset.export_episodes(str(self.folder), again, engines="sapien", task="Lift the {object}.")
+        xreset.export_episodes(str(self.folder), again, engine="sapien", task="Lift the {object}.")
         self.assertEqual(again.read_bytes(), out.read_bytes())
         words = f"^{self.folder}: there are no recorded episodes of not-sapien. Make"
         with self.assertRaisesRegex(RunError, words):
-            xreset.export_episodes(str(self.folder), again, engines="not-sapien")
+            xreset.export_episodes(str(self.folder), again, engine="not-sapien")
         with self.assertRaisesRegex(XResetError, "again.npz cannot hold films of cameras"):
             xreset.export_episodes(str(self.folder), again, cameras=["front"])
 

@@ -27,7 +27,7 @@ else:  # a command has texts in place of these
 
 @obeys_rules
 def check_engines(
-    engines: Annotated[str | Sequence[str], Option("engine")],
+    engine: Annotated[str | Sequence[str], Option("engine")],
     *,
     robot: str | Path | None = None,
     device: Device = "cpu",
@@ -38,7 +38,7 @@ def check_engines(
     """Test whether physics engines keep their contract. The command exits with 1 if one does not.
 
     Args:
-        engines: physics engine, or several; the command's default: all that can be used here.
+        engine: physics engine, or several; the command's default: all that can be used here.
         robot: name or folder of the robot to test with; default: a gripper, with which every check can run.
         device: where engines run that can use a GPU: cpu or cuda; the others run on the CPU.
         only: check to run, or several, with every measured number; default: all, with the number of each that is
@@ -58,7 +58,7 @@ def check_engines(
     from xreset.geometry.description import load_robot
 
     spec = load_robot(robot) if robot else conformance.scene().robot
-    names = texts(engines)
+    names = texts(engine)
     for name in names:  # before minutes of checks
         backend_class(name).engine_version()
     runs = [contract.check(name, spec, device, only, say) for name in names]
@@ -73,7 +73,7 @@ def check_engines(
 @obeys_rules
 def compare_engines(
     motion: str | Path,
-    engines: Annotated[str | Engine | Sequence[str | Engine], Option("engine")],
+    engine: str | Engine | Sequence[str | Engine],
     *,
     robot: str | Path | None = None,
     meshes: str | Path | None = None,
@@ -92,7 +92,7 @@ def compare_engines(
 
     Args:
         motion: file with the grasps: of xreset retarget, or of xreset demos, which is retargeted first.
-        engines: physics engine to measure, or several; the command's default: all that can be used here, on a CPU
+        engine: physics engine to measure, or several; the command's default: all that can be used here, on a CPU
             without MuJoCo-Warp, which is slow there.
         robot: name or folder of the robot; default: the file's.
         meshes: folder of real meshes; default: as the file names it, else the stand-ins.
@@ -110,7 +110,7 @@ def compare_engines(
     from xreset.eval.rollout import chosen_engines
     from xreset.resets.inputs import load_inputs
 
-    tested = [each for each in chosen_engines(engines, device) if each.name != agreement.REFERENCE]
+    tested = [each for each in chosen_engines(engine, device) if each.name != agreement.REFERENCE]
     inputs = load_inputs(motion, robot=robot, meshes=meshes, only=names, accept=("demos", "motion"))
     grasped = inputs.motion(partial(progress, "retargeting"))
     # hashed now, because after minutes of work the file may have changed

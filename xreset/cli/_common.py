@@ -23,12 +23,12 @@ def usable_engines() -> list[str]:
 
 def in_all_engines(arguments: dict[str, Any]) -> None:
     """Let a command without engines use all that can be used here."""
-    arguments["engines"] = arguments.get("engines") or usable_engines()
+    arguments["engine"] = arguments.get("engine") or usable_engines()
 
 
 def in_quick_engines(arguments: dict[str, Any]) -> None:
     """Let a command without engines use all that can be used here and are not slow on the device."""
-    arguments["engines"] = quick_engines(arguments.get("engines", ()), arguments["device"])
+    arguments["engine"] = quick_engines(arguments.get("engine", ()), arguments["device"])
 
 
 def quick_engines(names: Sequence[str], device: str) -> list[str]:

@@ -88,6 +88,6 @@ def _number(value: float | None, unit: str) -> str:
 
 COMMAND = {
     "": list_,
-    "check": verb(verbs.check_engines, _show_checks, prepare=in_all_engines, engines=()),
-    "compare": verb(verbs.compare_engines, _show_agreement, prepare=in_quick_engines, engines=()),
+    "check": verb(verbs.check_engines, _show_checks, prepare=in_all_engines, engine=()),
+    "compare": verb(verbs.compare_engines, _show_agreement, prepare=in_quick_engines, engine=()),
 }

@@ -147,5 +147,5 @@ COMMAND = {
     "check": verb(verbs.check_robot, _show_check),
     "import": verb(verbs.import_robot, _show_import, arm=None),
     "place": verb(verbs.place_robot, _show_places),
-    "judge": verb(verbs.judge, _show_judged, prepare=in_quick_engines, engines=()),
+    "judge": verb(verbs.judge, _show_judged, prepare=in_quick_engines, engine=()),
 }

@@ -169,7 +169,7 @@ def judge(
     bank: str | Path | ResetBank,
     robot: str | Path | RobotSpec | None = None,
     objects: Sequence[ObjectSpec] | None = None,
-    engines: Annotated[str | Sequence[str], Option("engine")] = "mujoco",
+    engine: str | Sequence[str] = "mujoco",
     *,
     meshes: str | Path | None = None,
     states: PositiveInt = 8,
@@ -192,7 +192,7 @@ def judge(
         bank: states that physics accepted, made by xreset resets.
         robot: name or folder of the robot; default: that of the bank.
         objects: the objects of the bank; default: those of ``meshes``.
-        engines: physics engine to try the states in, or several; the command's default: all that can be used here, on
+        engine: physics engine to try the states in, or several; the command's default: all that can be used here, on
             a CPU without MuJoCo-Warp, which is slow there.
         meshes: folder of real meshes; default: that of the bank, else the stand-ins.
         states: number of states of each object: those in the air in which the thumb and another finger are nearest to
@@ -217,7 +217,7 @@ def judge(
         inputs.bank,
         inputs.robot,
         inputs.objects,
-        texts(engines),
+        texts(engine),
         states=states,
         squeeze=squeeze,
         device=device,

@@ -124,14 +124,10 @@ def doubt_about_losses(bank: ResetBank, motion: Retargeted, file: str) -> str:
     """Return a doubt about demonstrations that lost almost all frames after contact, or nothing; ``file``: motion to
     look at."""
     reason = np.asarray(motion.reason_names, dtype=object)[motion.reason]
-    reason[motion.valid] = ""
-    frame = motion.frame_offsets[bank.rejected_sequence_index] + bank.rejected_frame_index
+    start = motion.frame_offsets
     rejected = np.asarray(bank.reason_names, dtype=object)[bank.rejected_reason]
-    if bank.rejected_frame_part is not None:
-        is_frame = bank.rejected_frame_part == 0
-        frame = frame[is_frame]
-        rejected = rejected[is_frame]
-    reason[frame] = rejected
+    reason[start[bank.rejected_sequence_index] + bank.rejected_frame_index] = rejected
+    reason[start[bank.sequence_index] + bank.frame_index] = ""  # also if states between are lost
     numbers = motion.sequence_of_frame.astype(str)
     rows = [row.without("not annotated") for row in accounts(numbers, motion.post_contact, reason)]
     few = [r for r in rows[:-3] if r.phase == "post-contact" and r.kept < _FEW * r.total]

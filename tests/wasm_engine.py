@@ -13,7 +13,6 @@ import subprocess
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from unittest import SkipTest
 
 import numpy as np
@@ -150,8 +149,7 @@ def main():
     parser.add_argument("--per-object", type=int, default=4)
     demos = synthesize(None, parser.parse_args().per_object, seed=1)
     engines = ["mujoco", "pybullet", "sapien", wasm_engine()]
-    with TemporaryDirectory() as folder:
-        print(evaluate("many-objects", demos, engines, episodes=1, out=folder))
+    print(evaluate("many-objects", demos, engines, episodes=1))
 
 
 if __name__ == "__main__":

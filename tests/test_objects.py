@@ -53,7 +53,6 @@ from xreset.objects.properties import Properties
 from xreset.objects.rest import rest_height, resting_orientation
 from xreset.objects.sampling import bounding_box, keypoints, surface_points
 from xreset.objects.verbs import make_shapes
-from xreset.pictures.verbs import import_objects
 
 Z = np.array([0.0, 0.0, 1.0])
 BOX = trimesh.creation.box((0.1, 0.06, 0.04))
@@ -375,13 +374,6 @@ class MeshImport(InFolder):
                 path = self.write(trimesh.Trimesh(box.vertices, box.faces[:-1]))
                 with patch("xreset.objects.meshes.cached_pieces", return_value=pieces):
                     self.assertRaisesRegex(ObjectError, words, import_with_notes, path, name)
-
-    def test_the_progress_of_cutting_is_seen(self):
-        done = []
-        out = self.folder / "objects"
-        import_objects(self.write(RING), out=out, progress=lambda _, at, total: done.append(at))
-        self.assertEqual(done, sorted(done))
-        self.assertTrue(0.0 < done[1] < done[-1] < 1.0)
 
     def test_a_killed_command_can_be_repeated(self):
         path = self.write(BOX)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict
 from importlib.metadata import distributions
@@ -15,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from xreset.errors import FileFormatError, ObjectError, XResetError
-from xreset.files.progress import unseen
 from xreset.files.records import POSITION, Field, read_npz, write_npz
 from xreset.geometry.shapes import hull
 from xreset.objects.decompose import Pieces, Settings, decompose
@@ -40,18 +38,17 @@ _ALGORITHM = 4
 """Raise it when :mod:`xreset.objects.decompose` gives other pieces or mass properties than before."""
 
 
-def cached_pieces(
-    mesh: trimesh.Trimesh,
-    source: str,
-    settings: Settings,
-    progress: Callable[[float], None] = unseen,
-) -> Pieces:
-    """Return the pieces of a mesh, from the cache if they are there; ``source``: SHA-256 of the mesh's file."""
+def cached_pieces(mesh: trimesh.Trimesh, source: str, settings: Settings) -> Pieces:
+    """Return the pieces of a mesh, from the cache if they are there.
+
+    Args:
+        source: SHA-256 of the mesh's file.
+    """
     cutter = [found.version for found in distributions(name="manifold3d")]
     identity = json.dumps([SCHEMA_NAME, source, asdict(settings), _ALGORITHM, cutter])
     folder = cache_folder()
     if folder is None:
-        return decompose(mesh, settings, progress)
+        return decompose(mesh, settings)
     path = folder / "objects" / f"{hashlib.sha256(identity.encode()).hexdigest()}.npz"
     with suppress(OSError):  # a cache that cannot be read or written costs time, nothing else
         if path.is_file():
@@ -59,7 +56,7 @@ def cached_pieces(
                 return _read_pieces(path)
             except (FileFormatError, ObjectError):
                 path.unlink(missing_ok=True)  # damaged: make it again
-    pieces = decompose(mesh, settings, progress)
+    pieces = decompose(mesh, settings)
     parts = [np.asarray(piece.geometry.vertices) for piece in pieces.shapes]
     arrays = {"vertices": np.concatenate(parts), "offsets": np.cumsum([0, *map(len, parts)])}
     arrays |= {name: np.asarray(getattr(pieces, name)) for name in _NUMBERS}

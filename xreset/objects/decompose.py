@@ -19,7 +19,6 @@ from scipy.spatial import ConvexHull, cKDTree
 
 from xreset.errors import ObjectError, needs
 from xreset.files.checks import frozen
-from xreset.files.progress import unseen
 from xreset.geometry.shapes import (
     MANY_POINTS,
     half_spaces,
@@ -115,16 +114,11 @@ class Pieces:
     """Whether cutting ended before :attr:`Settings.effort` was spent."""
 
 
-def decompose(
-    mesh: trimesh.Trimesh,
-    settings: Settings = Settings(),
-    progress: Callable[[float], None] = unseen,
-) -> Pieces:
+def decompose(mesh: trimesh.Trimesh, settings: Settings = Settings()) -> Pieces:
     """Return convex pieces that together have the mesh's shape.
 
     Args:
         mesh: closed or not (:func:`as_solid`); its metadata may have the object's ``name``, for a message.
-        progress: called with the share of the effort that is spent.
 
     Raises:
         ObjectError: the mesh is concave and manifold3d, which cuts it, is not installed; or the mesh encloses nothing,
@@ -152,7 +146,7 @@ def decompose(
             com, inertia = mass_properties(*mesh_arrays(solid), 1.0)
     else:
         whole = as_solid(mesh)
-        cutter = _Cutter(whole, settings, mesh.metadata.get("name", "the mesh"), progress)
+        cutter = _Cutter(whole, settings, mesh.metadata.get("name", "the mesh"))
         shapes, deviation = cutter.shapes()
         finished = cutter.effort > 0
         surface = cutter.surface
@@ -402,9 +396,7 @@ class _Cutter:
     """One decomposition of a solid. Pieces are cut from a copy with fewer triangles; in the end they are measured
     against the whole solid."""
 
-    def __init__(
-        self, whole: Manifold, settings: Settings, name: str, progress: Callable[[float], None]
-    ) -> None:
+    def __init__(self, whole: Manifold, settings: Settings, name: str) -> None:
         """Prepare a solid; ``ObjectError`` if it consists of specks."""
         self.surface = _Solid(whole)
         self.effort = settings.effort
@@ -418,7 +410,6 @@ class _Cutter:
         self._solid = _Solid(simple)
         self._settings = settings
         self._name = name
-        self._progress = progress
 
     def shapes(self) -> tuple[list[Shape], float]:
         """Return the pieces and their largest deviation [m]."""
@@ -437,10 +428,9 @@ class _Cutter:
         cut.sort(key=lambda entry: entry[1])
         return [_shape(piece) for *_, piece in cut], max(-excess for excess, *_ in cut)
 
-    def _spend(self, triangles: int) -> None:
+    def _spend(self, *solids: Manifold) -> None:
         before = self.effort
-        self.effort -= triangles
-        self._progress(1.0 - max(self.effort, 0) / self._settings.effort)
+        self.effort -= sum(solid.num_tri() for solid in solids)
         if self.effort < _LONG * self._settings.effort <= before:
             _log.warning("%s is cut into convex pieces, which takes up to a minute", self._name)
 
@@ -481,11 +471,11 @@ class _Cutter:
         return whole + queue
 
     def _quick_excess(self, part: Manifold) -> float:
-        self._spend(self._solid.solid.num_tri() + part.num_tri())
+        self._spend(self._solid.solid, part)
         return self._solid.excess(part.hull(), quick=True)
 
     def _excess(self, piece: Manifold) -> float:
-        self._spend(self.surface.solid.num_tri())
+        self._spend(self.surface.solid)
         limited = _manifold3d().Manifold.hull_points(_shape(piece).geometry.vertices)
         return self.surface.excess(limited, quick=False)
 
@@ -503,7 +493,7 @@ class _Cutter:
         whole = part.hull().volume()
         for planes in _planes(*_arrays(part)):
             parts = [part]
-            self._spend(part.num_tri())
+            self._spend(part)
             for normal, offset in planes:
                 halves = [one.split_by_plane(tuple(normal), float(offset)) for one in parts]
                 parts = list(itertools.chain.from_iterable(halves))
@@ -535,7 +525,7 @@ class _Cutter:
                 other_low, other_high = boxes[other]
                 near = ((low <= other_high + _TOUCH) & (other_low <= high + _TOUCH)).all()
                 if near and self.effort > 0:
-                    self._spend(max(self._solid.solid.num_tri(), _LEAST_EFFORT))
+                    self.effort -= max(self._solid.solid.num_tri(), _LEAST_EFFORT)
                     both = batch_hull([piece, neighbour])
                     if self._solid.excess(both, quick=True) <= tolerance:
                         added = both.volume() - piece.volume() - neighbour.volume()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import re
 import tempfile
-from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -16,7 +15,6 @@ from scipy.spatial import QhullError
 
 from xreset.errors import ObjectError
 from xreset.files.checks import frozen
-from xreset.files.progress import unseen
 from xreset.files.storage import file_hash, write_whole
 from xreset.files.text import shown
 from xreset.geometry.shapes import load_mesh, mesh_arrays, shell_properties, winding_number
@@ -99,9 +97,7 @@ def _warn_once(name: str, note: str) -> None:
     _log.warning("%s: %s", name, note)
 
 
-def import_with_notes(
-    path: str | Path, name: str, progress: Callable[[float], None] = unseen
-) -> Import:
+def import_with_notes(path: str | Path, name: str) -> Import:
     """Read a mesh, cut it into convex pieces and compute its mass properties.
 
     A closed mesh whose mass is that of no solid (below 120 kg/m^3) is a shell: its mass is spread evenly over its
@@ -112,7 +108,6 @@ def import_with_notes(
             (:mod:`xreset.objects.properties`).
         name: the object's name. The masses of the YCB object set are known by name, other masses follow from a
             density.
-        progress: called with the share of the largest effort of cutting that is spent.
 
     Raises:
         ObjectError: the file is missing, damaged, empty or flat, or not in metres.
@@ -132,7 +127,7 @@ def import_with_notes(
         if own.tolerance is not None:
             settings = Settings(hull_depth=0.0, tolerance=own.tolerance)
         mesh.metadata["name"] = name
-        pieces = cached_pieces(mesh, cut, settings, progress)
+        pieces = cached_pieces(mesh, cut, settings)
         if known is None:
             _check_density(mesh, _density(own) * pieces.volume)
     except ObjectError as error:
@@ -243,7 +238,6 @@ def add_mesh(
     *,
     scale: float = 1.0,
     properties: Properties | None = None,
-    progress: Callable[[float], None] = unseen,
 ) -> Import:
     """Import a mesh of any format and scale, and put it with its properties as ``NAME.obj`` and ``NAME.toml`` into a
     folder.
@@ -276,7 +270,7 @@ def add_mesh(
         draft.write_text(text)
         draft.with_suffix(".toml").write_text(known)
         try:
-            result = import_with_notes(draft, name, progress)
+            result = import_with_notes(draft, name)
         except ObjectError as error:  # the user knows only the mesh's own name
             raise ObjectError(str(error).replace(str(draft), str(path))) from error
     write_whole(target.with_suffix(".toml"), known)

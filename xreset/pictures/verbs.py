@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -169,8 +168,7 @@ def import_objects(
         mass: mass in kg.
         friction: friction coefficient: the middle of the range that training and evaluation draw from.
         picture: PNG to write: the meshes next to their pieces, with the deviation in millimetres.
-        progress: called with (the mesh that is cut, meshes done, with the share of this one's largest effort, meshes in
-            all).
+        progress: called with (the mesh that is cut, meshes done, meshes in all).
 
     Raises:
         ObjectError: a mesh cannot be used, or options do not fit together.
@@ -211,13 +209,12 @@ def import_objects(
         files = {name or path.stem: path}
     found = []
     for object_name, file in files.items():
-        moved = partial(_move, progress, f"{object_name} ({file})", len(found), len(files))
-        moved(0.0)
+        progress(f"{object_name} ({file})", len(found), len(files))
         if out is None:
-            result = meshes.import_with_notes(file, object_name, moved)
+            result = meshes.import_with_notes(file, object_name)
         else:
             result = meshes.add_mesh(
-                file, Path(out), object_name, scale=scale, properties=properties, progress=moved
+                file, Path(out), object_name, scale=scale, properties=properties
             )
         found.append(result)
     if picture is not None:
@@ -229,7 +226,3 @@ def import_objects(
         objects = [result.obj for result in found]
         render.write_png(Path(picture), pieces.draw_pieces(objects, captions))
     return found
-
-
-def _move(progress: NamedProgress, mesh: str, done: int, total: int, share: float) -> None:
-    progress(mesh, done + share, total)

@@ -13,8 +13,9 @@ What differs from SAPIEN's defaults, and why:
 - The robot feels no gravity (if it is compensated), nor does the object, whose weight is part of its force.
 - PhysX reports the normal forces of contacts only; friction is computed from the object's momentum
   (:func:`~xreset.backends.rigid.friction_forces`).
-- Lengths are in 1/32 m. PhysX's search for nearest points (GJK) takes for flat what is thinner than 1e-4. In metres, it
-  misses contacts at the edges of small hulls. Between two boxes it misses by millimetres in any unit: boxes are hulls.
+- Lengths are in 1/32 m. PhysX's search for nearest points (GJK) treats a simplex that is thinner than 1e-4 as flat. In
+  metres, it misses contacts at the edges of small hulls.
+- Boxes are hulls. In any unit of length, PhysX's depth between two boxes is wrong by millimetres.
 - Linear velocities refer to the centre of mass; they are converted here. Those of links belong to the poses before the
   last step, so links are computed from the joints. PhysX computes in single precision.
 """

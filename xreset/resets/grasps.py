@@ -140,8 +140,8 @@ def planned_grasps(model: HandModel, obj: ObjectSpec) -> Grasps:
     pairs = _pairs(surface, float(jaw.opening[-1]) - 2 * _GAP)
     generator = torch.Generator().manual_seed(0)
     if not len(pairs):
-        none = pairs[:, 0, 0]
-        return replace(jaw.grasps(pairs, none, none), missing="too wide")
+        nothing = pairs.new_zeros(0)
+        return replace(jaw.grasps(pairs, nothing, nothing), missing="too wide")
     found = []
     for _ in range(_ROUNDS):
         drawn = pairs[torch.randint(len(pairs), (_TRIED,), generator=generator)]

@@ -324,21 +324,21 @@ def cloud(
 def paired_cloud(
     x: ObservationInput, *, noise: NonNegativeFloat, scale: PositiveFloat, palm: bool = False
 ) -> Tensor:
-    """[N, 1, P, 9] position of every point, its position at the goal, and the goal's minus the present one, in this
-    frame only (the published paper): the pose error point by point.
+    """[N, 1, P, 9] present position of every point, its position at the goal, and the goal's minus the present one (the
+    published paper): the pose error point by point.
 
     Args:
         x: the step.
         noise: standard deviation of the points [m].
         scale: factor on all coordinates [1/m].
-        palm: the point's position in the palm's frame takes the place of its position at the goal. Not in the paper.
+        palm: in place of its position at the goal, each point has its position in the palm's frame. Not in the paper.
     """
     here = x.noisy(x.world_points, noise)
     goal = quat_rotate(x.goal_quat[:, None], x.points) + x.goal_pos[:, None]
+    second = goal
     if palm:
-        of_palm = quat_rotate_inverse(x.links.quat[:, :1], here - x.links.pos[:, :1])
-        return scale * torch.cat((here, of_palm, goal - here), dim=-1)[:, None]
-    return scale * torch.cat((here, goal, goal - here), dim=-1)[:, None]
+        second = quat_rotate_inverse(x.links.quat[:, :1], here - x.links.pos[:, :1])
+    return scale * torch.cat((here, second, goal - here), dim=-1)[:, None]
 
 
 # For the critic -------------------------------------------------------------------------------------------------------

@@ -9,12 +9,14 @@ from unittest import mock
 import numpy as np
 import torch
 from torch import tensor
+from torch.testing import assert_close
 
 from xreset.backends.conformance.grasp_checks import grasp
 from xreset.backends.conformance.harness import Bench
 from xreset.backends.conformance.scene import gripper, objects, scene
 from xreset.backends.pool import PoolBackend
 from xreset.errors import BackendUnavailableError
+from xreset.geometry.kinematics import Kinematics
 from xreset.geometry.rotations import quat_rotate
 from xreset.spec import GRAVITY
 
@@ -58,6 +60,27 @@ class EngineChecks:
                 self.assertRaisesRegex(BackendUnavailableError, rf"xreset\[{self.module}\]"),
             ):
                 getattr(engine, "__wrapped__", engine)()
+
+    # Joints -----------------------------------------------------------------------------------------------------------
+
+    def test_a_mimic_joint_shares_its_sources_force(self):
+        backend, _ = self.grasp()
+        backend.set_object_gravity(torch.zeros(1))
+        backend.step(240)
+        jaw = JOINT["jaw_a_slide"]
+        state = backend.state()
+        lag = float(state.joint_pos[0, jaw] - state.joint_target[0, jaw])
+        drive = gripper().joints[jaw].drive.kp * lag
+        along = (
+            Kinematics(gripper())
+            .link_poses(state.joint_pos[0].double(), ["wrist"])[0, :3, 0]
+            .float()
+        )
+        force = (backend.contacts().tip_force[0] @ along).abs()
+        # Both forces are equal, because the brick does not move: F + 1.1 F = drive.
+        assert_close(force, torch.full((2,), drive / 2.1), rtol=0.03, atol=0.0)
+
+    # Contacts ---------------------------------------------------------------------------------------------------------
 
     def test_contact_forces_explain_the_objects_motion(self):
         self.enterContext(self.one_step)

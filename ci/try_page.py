@@ -34,7 +34,6 @@ from xreset.geometry.dynamics import drive_values
 from xreset.geometry.shapes import transformed
 from xreset.geometry.urdf import link_meshes
 from xreset.objects.catalogue import object_names
-from xreset.objects.sampling import center, surface_points
 from xreset.pictures.meshes import (
     GOAL_COLOR,
     OBJECT_COLOR,
@@ -192,14 +191,13 @@ def physics_part(scene: SceneSpec, object_index: int) -> dict[str, Any]:
     }
 
 
-def object_part(obj: ObjectSpec, cloud_points: int) -> dict[str, Any]:
-    """Return what the picture, the policy and a pull need of an object."""
+def object_part(obj: ObjectSpec, known: dict[str, np.ndarray]) -> dict[str, Any]:
+    """Return what the picture, the policy (:attr:`Session.known`) and a pull need of an object."""
     return {
+        **{name: value.ravel().tolist() for name, value in known.items()},
         "mass": obj.mass,
         "com": np.asarray(obj.com).tolist(),
         "inertia": float(np.linalg.eigvalsh(obj.inertia)[-1]),
-        "center": center(obj).tolist(),
-        "points": surface_points(obj, cloud_points).ravel().tolist(),
         "corners": encoded(np.asarray(obj.vertices, dtype=np.float64).ravel()),
         "mesh": drawn(object_mesh(obj)),
     }
@@ -224,7 +222,7 @@ def scene_of(name: str, policy: PolicySpec) -> tuple[SceneSpec, dict[str, Any]]:
     session = Session(policy, object_name=name)
     session.close()
     content = physics_part(session.scene, 0)
-    content["object"] = object_part(session.scene.objects[0], len(session.points))
+    content["object"] = object_part(session.scene.objects[0], session.known)
     content["starts"] = starts_of(session.bank)
     return session.scene, content
 

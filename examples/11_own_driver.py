@@ -58,8 +58,7 @@ def main(folder: Path, recording: Path, episode: int = 0) -> None:
 
     controller = runtime.load_controller(folder)
     robot = ReplayedRobot()
-    points = controller.points(robot.object)
-    controller.begin(points, *robot.goal, robot.joint_pos[0], controller.center(robot.object))
+    controller.begin(controller.object(robot.object), *robot.goal, robot.joint_pos[0])
     outcome = runtime.Runner(controller, robot).run(float(robot.times[-1]))
     print(f"{outcome.steps} steps; stopped because: {outcome.reason or 'the recording is over'}")
     print(f"targets differ from the recorded ones by {np.mean(robot.errors):.3f} rad")

@@ -60,8 +60,8 @@ def main(folder: str, object_name: str, seconds: float = float("inf")) -> None:
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)  # Ctrl-C is for the runner
     controller = runtime.load_controller(folder)
     robot = RosRobot(rclpy.create_node("policy"))
-    points, center = controller.points(object_name), controller.center(object_name)
-    controller.begin(points, *robot.pose("goal_pose"), robot.read().joint_pos, center)
+    obj = controller.object(object_name)
+    controller.begin(obj, *robot.pose("goal_pose"), robot.read().joint_pos)
     print(runtime.Runner(controller, robot).run(seconds).reason)
 
 

@@ -63,7 +63,7 @@ import runtime
 data = np.load(recording)
 controller = runtime.load_controller(folder)
 name = str(data["object"])
-controller.begin(controller.points(name), data["goal_pos"], data["goal_quat"], data["start"], controller.center(name))
+controller.begin(controller.object(name), data["goal_pos"], data["goal_quat"], data["start"])
 names = ("joint_pos", "joint_vel", "object_pos", "object_quat", "tip_force")
 worst = 0.0
 for k in range(len(data["target"])):
@@ -144,7 +144,7 @@ class ToyTest(InFolder):
     def begin(self, **changes):
         brick = self.contract["objects"]["brick"]
         good = {
-            "object_points": brick["points"], "center": brick["center"], "target": self.home,
+            "obj": brick, "target": self.home,
             "goal_pos": [0.5, 0.3, 0.2], "goal_quat": [1, 0, 0, 0],
         }  # fmt: skip
         self.controller.begin(**good | changes)
@@ -192,10 +192,11 @@ class ToyTest(InFolder):
         with self.assertRaisesRegex(
             LiveError, "has no object 'hat'. Choose from: brick.*--object NAME"
         ):
-            self.controller.points("hat")
+            self.controller.object("hat")
 
     def test_an_episode_that_does_not_fit_is_refused(self):
-        points = np.array(self.contract["objects"]["brick"]["points"])
+        brick = self.contract["objects"]["brick"]
+        points = np.array(brick["points"])
         first = self.controller.step(self.begin())
         for name, value, words in (
             ("target", self.home[1:], r"target has shape \(4,\), expected \(5,\)"),
@@ -206,13 +207,16 @@ class ToyTest(InFolder):
             ("target", [float("nan")] * 5, "target of .* is nan"),
             ("goal_pos", [500.0, 300.0, 200.0], "expected at most 10 m. Are these millimetres"),
             ("goal_pos", [float("nan")] * 3, "expected at most 10 m"),
-            ("object_points", 1000 * points, "The object .* at most 10 m. Are these millimetres"),
-            ("object_points", points[1:], r"points of shape \(63, 3\), expected \(64, 3\)"),
+            ("obj", brick | {"points": 1000 * points}, "points has .* Are these millimetres"),
+            ("obj", brick | {"points": points[1:]}, r"shape \(63, 3\), expected \(64, 3\)"),
+            ("obj", {"points": points}, "needs normals of the object"),
+            ("obj", brick | {"normals": points[1:]}, r"shape \(63, 3\), expected \(64, 3\)"),
+            ("obj", points, "needs points of the object. Give an object"),
         ):
             reading = self.begin()
             target = self.controller.step(reading)
             assert_array_equal(target, first, "it remembers nothing of an earlier episode")
-            with self.subTest(name, value=np.shape(value)):
+            with self.subTest(name, words=words):
                 self.assertRaisesRegex(LiveError, words, self.begin, **{name: value})
                 self.assertRaisesRegex(LiveError, "has begun", self.controller.step, reading)
 
@@ -538,9 +542,9 @@ class EndlessTest(InFolder):
         start[0] = turned
         nowhere = np.zeros(3)
         upright = np.array([1.0, 0, 0, 0])
-        controller.begin(
-            np.zeros(controller.shapes["object_points"]), nowhere, upright, start, nowhere
-        )
+        points = np.zeros(controller.shapes["object_points"])
+        obj = {"points": points, "normals": points, "center": nowhere}
+        controller.begin(obj, nowhere, upright, start)
         reading = Reading(
             joint_pos=start,
             joint_vel=np.zeros_like(start),

@@ -416,6 +416,28 @@ class RobustnessTest(WithEnv):
         assert_close(joints[1], scaled[1, 3:])  # the new episode's, from its first step
         self.assertGreater((joints - scaled[:, 3:])[[0, 2]].abs().amax(), 1e-3)
 
+    def test_what_follows_from_late_joints_is_as_late(self):
+        """The palm's pose, and the object in its frame; the critic has the present pose."""
+        pose = {"palm_pos": {}, "palm_quat": {}}
+        observation = ObservationConfig(
+            cloud_points=4,
+            policy=pose,
+            proprio=pose,
+            perception={"palm_cloud": {"noise": 0.0, "scale": 1.0}},
+            privileged=pose,
+        )
+        late = replace(self.task(proprio_latency=(1.0, 1.0)), observation=observation)
+        task = replace(late, randomization=QUIET.randomization)
+        found, present = (self.play(self.make(each), 4) for each in (late, task))
+        for now, before in zip(found[1:], present, strict=False):
+            assert_close(now["policy"], before["policy"])
+            assert_close(now["proprio"], before["policy"])
+            pos, quat = now["policy"][:, None].split((3, 4), dim=-1)
+            here, of_palm, _, _ = now["perception"][:, 0].split(3, dim=-1)
+            assert_close(quat_rotate(quat, of_palm) + pos, here)
+        for now, same in zip(found, present, strict=True):
+            assert_close(now["privileged"], same["policy"])
+
     def test_arm_and_hand_may_be_late_apart(self):
         env = self.make(self.task(action_latency=(0.0, 0.0), hand_latency=(1.0, 1.0)))
         last = env.joint_target.clone()

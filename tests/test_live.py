@@ -14,10 +14,9 @@ from tests.data import refuses
 from xreset.eval.robot_loop import SimulatedRunner
 from xreset.eval.rollout import engine, episode_starts
 from xreset.learning.recipes import RECIPES
-from xreset.live.deploy import deploy_contract
+from xreset.live.deploy import deploy_contract, known_of
 from xreset.live.engine import EngineDriver, centers
 from xreset.live.graph import Act, Observe
-from xreset.objects.sampling import surface_points
 from xreset.runtime import Driver, Limits, LiveError, Reading, Runner
 from xreset.runtime.contract import joint_values
 from xreset.task.config import TaskConfig, evaluation_task
@@ -427,7 +426,8 @@ class EngineTest(TestCase):
         observe = Observe(robot, task, ())
         act = Act(robot, task)
         memory = torch.zeros(2, observe.memory)
-        points = torch.as_tensor(surface_points(toy_grasp.brick(), 64), dtype=torch.float32)
+        known = known_of(toy_grasp.brick(), 64)
+        points, normals = (torch.as_tensor(known[n]).expand(2, -1, -1) for n in ("points", "normals"))
         with played.worlds(engine("mujoco", workers=0), torch.zeros(2, dtype=torch.long)) as env:
             env.reset(start=start)
             driver = EngineDriver(env)
@@ -438,7 +438,7 @@ class EngineTest(TestCase):
                 flat, cloud, kept, links = observe(
                     reading["joint_pos"], reading["joint_vel"], env.joint_target.clone(),
                     reading["object_pos"], reading["object_quat"], reading["tip_force"],
-                    env.goal_pos, env.goal_quat, points.expand(2, -1, -1), center, memory,
+                    env.goal_pos, env.goal_quat, points, normals, center, memory,
                 )  # fmt: skip
                 seen = env.get_observations()
                 expected = torch.cat((seen["policy"], seen["proprio"]), dim=1)

@@ -51,7 +51,7 @@ from xreset.objects.meshes import (
 )
 from xreset.objects.properties import Properties
 from xreset.objects.rest import rest_height, resting_orientation
-from xreset.objects.sampling import bounding_box, keypoints, surface_points
+from xreset.objects.sampling import bounding_box, keypoints, surface_normals, surface_points
 from xreset.objects.verbs import make_shapes
 
 Z = np.array([0.0, 0.0, 1.0])
@@ -171,6 +171,14 @@ class Sampling(TestCase):
         obj = load_object("soup")
         points = surface_points(obj, 64)
         self.assertGreater(cKDTree(points).query(points, k=2)[0][:, 1].min(), 0.008)
+
+    def test_normals_lead_out_of_the_solid(self):
+        obj = load_object("scissors")
+        points, normals = surface_points(obj), surface_normals(obj)
+        assert_allclose(np.linalg.norm(normals, axis=1), 1.0)
+        assert_allclose(distance_to_pieces(points + 1e-3 * normals, obj.pieces), 1e-3, atol=3e-4)
+        depth = winding_number(points - 1e-4 * normals, obj.vertices, obj.faces)
+        self.assertTrue((depth > 0.5).all())
 
     def test_most_of_a_surface_may_be_inside(self):
         """Before, there were fewer points than were wanted, as with a machine and its parts."""

@@ -373,14 +373,19 @@ class EarlierOptionsTest(TestCase):
             task = RECIPES[name].task
             found = from_dict(TaskConfig, options)
             expected = deepcopy(task.reward)
-            # Only recipes of today ask the tips of a jaw to oppose each other.
+            observed = deepcopy(task.observation)
+            # Only recipes of today ask the tips of a jaw to oppose each other,
             expected.terms.get("grasp", {}).pop("opposing_jaw", None)
+            # and show the object as the hand sees it.
+            if "palm_cloud" in observed.perception:
+                observed.policy.pop("tip_to_object")
+                observed.perception["paired_cloud"] = observed.perception.pop("palm_cloud")
             with self.subTest(name):
-                self.assertEqual(found.observation, task.observation)
+                self.assertEqual(found.observation, observed)
                 self.assertEqual(found.reward, expected)
                 self.assertEqual([*found.reward.terms], [*task.reward.terms])
                 for group in GROUPS:
-                    names = [[*getattr(each.observation, group)] for each in (found, task)]
+                    names = [[*getattr(each, group)] for each in (found.observation, observed)]
                     self.assertEqual(*names, "the order of random draws")
 
     def test_options_that_no_recipe_has(self):
@@ -1137,6 +1142,7 @@ class ObservationTest(TestCase):
             joint_lower=torch.full((self.J,), -2.0),
             joint_upper=torch.full((self.J,), 3.0),
             points=torch.zeros(self.N, 1, 3),
+            normals=torch.zeros(self.N, 1, 3),
             observed_pos=rand(3),
             observed_quat=quat(),
             goal_pos=rand(3),
@@ -1266,25 +1272,27 @@ class ObservationTest(TestCase):
     def test_the_layout_has_the_widths_and_the_order_of_the_groups(self):
         for name, recipe in RECIPES.items():
             c = recipe.task.observation
-            x = replace(self.x, points=torch.zeros(self.N, c.cloud_points, 3))
+            points = torch.zeros(self.N, c.cloud_points, 3)
+            x = replace(self.x, points=points, normals=points)
             for group, widths in obs.layout(self.J, self.E, c).items():
                 value = obs.Observer(c).group(group, x)
                 self.assertEqual(value[0].numel(), sum(widths.values()), (name, group))
                 self.assertEqual([*widths], [*getattr(c, group)])
 
     def test_clouds(self):
-        points = torch.randn(self.N, 10, 3, generator=generator(1))
-        x = replace(self.x, points=points)
+        points, normals = torch.randn(2, self.N, 10, 3, generator=generator(1))
+        x = replace(self.x, points=points, normals=normals)
         now = quat_rotate(self.x.observed_quat[2], points[2, 7]) + self.x.observed_pos[2]
         goal = quat_rotate(self.x.goal_quat[2], points[2, 7]) + self.x.goal_pos[2]
         to_palm = quat_conjugate(self.x.links.quat[2, 0])
         of_palm = quat_rotate(to_palm, now - self.x.links.pos[2, 0])
-        near = 5.0 * torch.cat((now, of_palm, goal - now))
+        normal = quat_rotate(to_palm, quat_rotate(self.x.observed_quat[2], normals[2, 7]))
+        near = torch.cat((5.0 * now, 5.0 * of_palm, 5.0 * (goal - now), normal))
         for name, parameters, expected in (
             ("cloud", {"frames": 3, "scale": 1.0}, now),
             ("cloud", {"frames": 1, "scale": 5.0}, 5.0 * now),
             ("paired_cloud", {"scale": 5.0}, 5.0 * torch.cat((now, goal, goal - now))),
-            ("paired_cloud", {"scale": 5.0, "palm": True}, near),
+            ("palm_cloud", {"scale": 5.0}, near),
         ):
             c = ObservationConfig(perception={name: {"noise": 0.0} | parameters}, cloud_points=10)
             cloud = obs.Observer(c).group("perception", x)

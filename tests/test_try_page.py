@@ -105,7 +105,7 @@ class PolicyTest(unittest.TestCase):
         self.addCleanup(session.close)
         folder = Path(self.enterContext(TemporaryDirectory()))
         try_page.write_policy(folder)
-        obj = try_page.object_part(session.scene.objects[0], 64)
+        obj = try_page.object_part(session.scene.objects[0], session.known)
         ask(do="load", folder=str(folder), object=obj)
         goal = {"goalPos": session.goal_pos.tolist(), "goalQuat": session.goal_quat.tolist()}
         for _ in range(45):

@@ -36,6 +36,7 @@ export class Policy {
       goal_pos: goalPos,
       goal_quat: goalQuat,
       object_points: this.object.points,
+      object_normals: this.object.normals,
       object_center: this.object.center,
       memory_in: this.memory,
     };

@@ -24,9 +24,9 @@ from xreset.geometry.dynamics import drive_values
 from xreset.geometry.kinematics import on_host
 from xreset.geometry.shapes import turn_of
 from xreset.geometry.urdf import joint_limits
+from xreset.live.deploy import known_of
 from xreset.objects.catalogue import ALIASES, canonical_name, object_names
 from xreset.objects.rest import rest_height
-from xreset.objects.sampling import center, surface_points
 from xreset.resets.bank import ResetBank
 from xreset.resets.inputs import load_inputs
 from xreset.runtime import Controller, Reading
@@ -113,7 +113,8 @@ class Session:
         history: the last :data:`KEPT_SECONDS` of this object and robot, oldest first.
         away: whether the object is taken away.
         objects: names of the objects to choose from.
-        points: [P, 3] points of the object's surface that the policy observes, in its mesh frame [m].
+        known: what the policy takes of the object: ``points`` and ``normals`` [P, 3] of its surface and its ``center``
+            [3], in its mesh frame [m].
         bank: starts and goals.
         random: source of starts and goals.
     """
@@ -219,8 +220,7 @@ class Session:
         self._kinematics = on_host(policy.robot)
         self._stiffness = drive_values(policy.robot, "kp")
         shapes = {} if controller is None else controller.shapes
-        points = shapes.get("object_points", (64, 3))[0]
-        self.points = surface_points(scene.objects[0], points)
+        self.known = known_of(scene.objects[0], shapes.get("object_points", (64, 3))[0])
         self.history: deque[Moment] = deque(maxlen=round(KEPT_SECONDS / self.control_dt))
         self._clear()
 
@@ -269,15 +269,9 @@ class Session:
         self.history.clear()
         self.target = self.world.state["joint_target"].astype(np.float32)
         """[J] the present targets of the drives, without a pull at the robot."""
-        self._center = center(self.scene.objects[0])
+        self._center = self.known["center"]
         if self._controller is not None:
-            self._controller.begin(
-                self.points,
-                self.goal_pos,
-                self.goal_quat,
-                self.target,
-                self._center,
-            )
+            self._controller.begin(self.known, self.goal_pos, self.goal_quat, self.target)
         self._set_gravity()
 
     def step(self) -> Moment:

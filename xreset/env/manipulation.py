@@ -10,6 +10,7 @@ training needs rsl-rl. Evaluations use the same class with another configuration
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -20,7 +21,7 @@ from xreset.errors import XResetError
 from xreset.files.checks import PositiveInt, Seed, obeys_rules
 from xreset.files.text import shown
 from xreset.geometry.rotations import quat_rotate, quat_rotate_inverse
-from xreset.objects.sampling import center, metric_points, surface_points
+from xreset.objects.sampling import center, metric_points, surface_normals, surface_points
 from xreset.physics import Backend, Parameters, State
 from xreset.physics.capture import GraphRunner
 from xreset.physics.plugins import make_backend
@@ -167,7 +168,9 @@ class ManipulationEnv:
             values = [torch.as_tensor(function(o), dtype=torch.float32) for o in scene.objects]
             return torch.stack(values).to(self.device)[backend.object_index]
 
-        self._cloud_points = of_worlds(lambda o: surface_points(o, task.observation.cloud_points))
+        count = task.observation.cloud_points
+        self._cloud_points = of_worlds(lambda o: surface_points(o, count))
+        self._cloud_normals = of_worlds(lambda o: surface_normals(o, count))
         self._surface_points = of_worlds(lambda o: surface_points(o, task.distance_points))
         self._metric_points = of_worlds(metric_points)
         self._center = None
@@ -577,12 +580,16 @@ class ManipulationEnv:
         )
         x = self._observation_input(reading)
         observed = self._observer.group
-        cloud = observed("perception", x)
+        proprio, links = self.variation.observed_proprio(
+            observed("proprio", x), x.links, self._reset_mask
+        )
+        seen = replace(x, links=links)  # by the policy; the critic knows where the links are
+        cloud = observed("perception", seen)
         history = torch.cat((self._cloud[:, 1:], cloud[:, -1:]), dim=1)
         self._cloud.copy_(where(self._reset_mask, cloud, history))
         groups = {
-            "policy": observed("policy", x),
-            "proprio": self.variation.observed_proprio(observed("proprio", x), self._reset_mask),
+            "policy": observed("policy", seen),
+            "proprio": proprio,
             "perception": self._cloud,
             "privileged": observed("privileged", x),
         }
@@ -612,6 +619,7 @@ class ManipulationEnv:
             joint_lower=self._joint_lower,
             joint_upper=self._joint_upper,
             points=self._cloud_points,
+            normals=self._cloud_normals,
             observed_pos=observed_pos,
             observed_quat=observed_quat,
             goal_pos=self.task_goal_pos,

@@ -16,7 +16,7 @@ from xreset.errors import PolicyError, needs
 from xreset.files.storage import atomic_folder, code_version
 from xreset.geometry.urdf import robot_tree
 from xreset.live import leapp
-from xreset.objects.sampling import center, surface_points
+from xreset.objects.sampling import center, surface_normals, surface_points
 from xreset.policy.onnx_policy import (
     METADATA_KEY,
     VERSION_KEY,
@@ -52,6 +52,7 @@ MEANINGS = {
     "goal_pos": "goal position of the object's mesh frame, world [m]",
     "goal_quat": "goal orientation, world",
     "object_points": "points on the object's surface, in its frame [m]: an entry of objects",
+    "object_normals": "outward unit normals of the surface at these points: an entry of objects",
     "object_center": "center of the object, in its frame [m]: an entry of objects",
     "memory_in": "zeros in the first step, then memory_out of the step before",
     "target": "joint targets for position drives, within the joints' limits [rad, m]",
@@ -92,20 +93,22 @@ def deploy_contract(
 
 
 def _listed(objects: Sequence[ObjectSpec], cloud_points: int) -> dict[str, Any]:
-    """Return points and center of objects, by name."""
+    """Return what a policy takes of objects, by name, as JSON."""
     listed = {}
     for each in objects:
-        listed[each.name] = {
-            "source": each.source,
-            "points": _rounded(surface_points(each, cloud_points)),
-            "center": _rounded(center(each)),
-        }
+        rows = {name: value.tolist() for name, value in known_of(each, cloud_points).items()}
+        listed[each.name] = {"source": each.source, **rows}
     return listed
 
 
-def _rounded(values: np.ndarray) -> list[Any]:
-    """Return numbers in single precision, as JSON."""
-    return values.astype(np.float32).tolist()
+def known_of(obj: ObjectSpec, cloud_points: int) -> dict[str, np.ndarray]:
+    """Return what a policy takes of an object: points [P, 3], the normals there [P, 3] and the center [3], in its frame
+    and in single precision."""
+    return {
+        "points": np.float32(surface_points(obj, cloud_points)),
+        "normals": np.float32(surface_normals(obj, cloud_points)),
+        "center": np.float32(center(obj)),
+    }
 
 
 def _joints(robot: RobotSpec, task: TaskConfig) -> list[dict[str, Any]]:

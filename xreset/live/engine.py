@@ -12,8 +12,8 @@ from torch import Tensor
 
 from xreset.env.manipulation import ManipulationEnv
 from xreset.geometry.rotations import quat_rotate
-from xreset.live.deploy import check_made_for, training_of
-from xreset.objects.sampling import center, surface_points
+from xreset.live.deploy import check_made_for, known_of, training_of
+from xreset.objects.sampling import center
 from xreset.runtime import Controller, Driver, Reading
 
 
@@ -97,9 +97,10 @@ def begin_episodes(controller: Controller, env: ManipulationEnv) -> None:
     objects = env.backend.scene.objects
     index = env.backend.object_index.tolist()
     count = controller.shapes.get("object_points", (1, 3))[0]
-    points = np.stack([surface_points(each, count) for each in objects])[index]
+    known = [known_of(each, count) for each in objects]
+    of_worlds = {name: np.stack([each[name] for each in known])[index] for name in known[0]}
     goal = (_array(env.goal_pos), _array(env.goal_quat))
-    controller.begin(points, *goal, _array(env.joint_target), centers(env))
+    controller.begin(of_worlds, *goal, _array(env.joint_target))
 
 
 def centers(env: ManipulationEnv) -> np.ndarray:

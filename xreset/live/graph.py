@@ -85,6 +85,7 @@ class Observe(nn.Module):
         goal_pos: Tensor,
         goal_quat: Tensor,
         object_points: Tensor,
+        object_normals: Tensor,
         object_center: Tensor,
         memory: Tensor,
     ) -> tuple[Tensor, ...]:
@@ -115,6 +116,7 @@ class Observe(nn.Module):
             joint_lower=self._lower,
             joint_upper=self._upper,
             points=object_points,
+            normals=object_normals,
             observed_pos=origin,
             observed_quat=object_quat,
             goal_pos=goal,
@@ -188,6 +190,7 @@ def _input_shapes(robot: RobotSpec, task: TaskConfig) -> dict[str, tuple[int, ..
         "goal_pos": (3,),
         "goal_quat": (4,),
         "object_points": (task.observation.cloud_points, 3),
+        "object_normals": (task.observation.cloud_points, 3),
         "object_center": (3,),
     }
 

@@ -28,25 +28,34 @@ def surface_points(obj: ObjectSpec, count: int = 64) -> np.ndarray:
     Uniform samples by area, without those inside the solid (where pieces of a stand-in overlap), thinned by
     farthest-point selection. Found once for each surface in a process.
     """
-    surface = blake2b(obj.vertices.tobytes() + obj.faces.tobytes()).digest()
-    key = (surface, count)
-    if key not in _SURFACE_POINTS:
-        _SURFACE_POINTS[key] = _spread_points(obj, count)
-    return _SURFACE_POINTS[key].copy()
+    return _surface(obj, count)[:, :3].copy()
 
 
-_SURFACE_POINTS: dict[tuple[bytes, int], np.ndarray] = {}
-"""Points that :func:`surface_points` has found, by surface and count."""
+def surface_normals(obj: ObjectSpec, count: int = 64) -> np.ndarray:
+    """[count, 3] outward unit normals of the surface at :func:`surface_points`."""
+    return _surface(obj, count)[:, 3:].copy()
+
+
+_SURFACES: dict[tuple[bytes, int], np.ndarray] = {}
+"""Points and normals [count, 6] that were found, by surface and count."""
+
+
+def _surface(obj: ObjectSpec, count: int) -> np.ndarray:
+    """[count, 6] points of the outer surface, and the normals there."""
+    key = (blake2b(obj.vertices.tobytes() + obj.faces.tobytes()).digest(), count)
+    if key not in _SURFACES:
+        _SURFACES[key] = _spread_points(obj, count)
+    return _SURFACES[key]
 
 
 def _spread_points(obj: ObjectSpec, count: int) -> np.ndarray:
-    points = np.empty((0, 3))
+    found = np.empty((0, 6))
     for each in _CANDIDATES_PER_POINT:
-        if len(points) < count:
+        if len(found) < count:
             points, _, normals = sample_surface(obj.vertices, obj.faces, max(each * count, 256))
             outside = winding_number(points + _PROBE * normals, obj.vertices, obj.faces) < 0.5
-            points = points[outside]
-    return farthest_points(points, count)
+            found = np.hstack((points, normals))[outside]
+    return found[farthest_points(found[:, :3], count)]
 
 
 def metric_points(obj: ObjectSpec, frame: Frame = "mesh") -> np.ndarray:
@@ -76,8 +85,8 @@ def sample_surface(
 
 
 def farthest_points(points: np.ndarray, count: int) -> np.ndarray:
-    """[count, 3] points chosen one after another, each the farthest from those chosen before; the first is the farthest
-    from the mean."""
+    """[count] indices of points [N, 3] chosen one after another, each the farthest from those chosen before; the first is
+    the farthest from the mean."""
     if len(points) < count:
         raise ObjectError(
             f"Only {len(points)} of {count} points are on the outside of the mesh. Repair it, for example in MeshLab."
@@ -87,7 +96,7 @@ def farthest_points(points: np.ndarray, count: int) -> np.ndarray:
     while len(chosen) < count:
         distance = np.minimum(distance, np.linalg.norm(points - points[chosen[-1]], axis=1))
         chosen.append(np.argmax(distance))
-    return points[chosen]
+    return np.array(chosen)
 
 
 def bounding_box(obj: ObjectSpec) -> tuple[np.ndarray, np.ndarray]:

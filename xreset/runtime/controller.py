@@ -5,7 +5,7 @@ Shape letters: N robots that act in step (one, except in rehearsals), J joints, 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,8 @@ _STRONGEST = 1e4
 _UNIT_TOLERANCE = 0.01
 """How far the length of a quaternion may be from 1."""
 _MEMORY = "memory_in"
+_OF_OBJECT = ("points", "normals", "center")
+"""Entries of an object that a graph may take, as ``object_points``, ..."""
 _READINGS = ("joint_pos", "joint_vel", "object_pos", "object_quat", "tip_force")
 """Inputs that a :class:`Reading` has."""
 
@@ -111,6 +113,7 @@ class Controller:
             "goal_pos": (3,),
             "goal_quat": (4,),
             "object_points": (None, 3),
+            "object_normals": (None, 3),
             "object_center": (3,),
             _MEMORY: (None,),
         }
@@ -131,25 +134,24 @@ class Controller:
 
     def begin(
         self,
-        object_points: Array,
+        obj: Mapping[str, Any],
         goal_pos: Array,
         goal_quat: Array,
         target: Array,
-        center: Array | None = None,
     ) -> None:
         """Begin an episode.
 
         Args:
-            object_points: [N, P, 3] or [P, 3] points of the object, in its frame; see :meth:`points`.
+            obj: the object, as :meth:`object` returns it, in its own frame: ``points`` [N, P, 3] or [P, 3], the outward
+                ``normals`` of its surface there, and its ``center`` [N, 3] or [3]; only those that the graph takes are
+                needed.
             goal_pos: [N, 3] or [3] goal position.
             goal_quat: [N, 4] or [4] goal orientation.
             target: [N, J] or [J] present joint targets of the robot.
-            center: [N, 3] or [3] origin that the object has for the policy, in its frame; see :meth:`center`. Needed
-                where the graph has the input ``object_center``.
 
         Raises:
             LiveError: a shape is not the contract's, a number is not finite or far outside its range, a quaternion has
-                another length than 1, or ``center`` is missing. No episode goes on then.
+                another length than 1, or something of the object is missing. No episode goes on then.
         """
         self._has_begun = False
         given = np.atleast_2d(np.array(target, dtype=np.float32))
@@ -159,18 +161,15 @@ class Controller:
         self._check_joints("target", given)
         self.target = given
         self._given: dict[str, Array] = {}
-        if "object_points" in self.shapes:
-            expected = self.shapes["object_points"]
-            shape = np.shape(object_points)
-            if shape[-2:] != expected:
-                raise LiveError(f"The object has points of shape {shape}, expected {expected}.")
-            self._given["object_points"] = self._positions("The object", object_points, *expected)
-        if "object_center" in self.shapes:
-            if center is None:
+        for entry in _OF_OBJECT:
+            name = f"object_{entry}"
+            if name not in self.shapes:
+                continue
+            if not isinstance(obj, Mapping) or entry not in obj:
                 raise LiveError(
-                    "This policy needs the center of the object. Give center, as Controller.center does."
+                    f"This policy needs {entry} of the object. Give an object with them, as Controller.object does."
                 )
-            self._given["object_center"] = self._positions("The center", center, 3)
+            self._given[name] = self._positions(f"The object's {entry}", obj[entry], *self.shapes[name])
         self._set_goal(goal_pos, goal_quat)
         if _MEMORY in self.shapes:
             self._given[_MEMORY] = np.zeros((len(given), *self.shapes[_MEMORY]), np.float32)
@@ -262,22 +261,15 @@ class Controller:
             )
         return [listed.index(name) for name in wanted]
 
-    def points(self, name: str) -> Array:
-        """[P, 3] points of an object, in its frame; ``LiveError`` if the contract has no such object."""
-        return self._of_object(name, "points")
-
-    def center(self, name: str) -> Array:
-        """[3] center of an object, in its frame; ``LiveError`` if the contract has no such object."""
-        return self._of_object(name, "center")
-
-    def _of_object(self, name: str, entry: str) -> Array:
+    def object(self, name: str) -> dict[str, Any]:
+        """Return an object for :meth:`begin`; ``LiveError`` if the contract has no such object."""
         objects = self.contract.get("objects", {})
         if name not in objects:
             raise LiveError(
                 f"The contract has no object {str(name)[:60]!r}. Choose from: {', '.join(objects)}. For another one, "
                 "export the policy again: xreset export deploy POLICY --object NAME --meshes FOLDER."
             )
-        return np.array(objects[name][entry], dtype=np.float32)
+        return objects[name]
 
     def step(self, reading: Reading) -> Array:
         """[N, J] new joint targets for a reading.
@@ -321,8 +313,10 @@ class Controller:
         joints = joint_values(self.contract, "home", 0.0)
         origin = np.zeros(3)
         upright = np.array([1.0, 0.0, 0.0, 0.0])
-        points = np.zeros(self.shapes.get("object_points", (1, 3)))
-        self.begin(points, origin, upright, joints, origin)
+        nowhere = {}
+        for entry in _OF_OBJECT:
+            nowhere[entry] = np.zeros(self.shapes.get(f"object_{entry}", ()))
+        self.begin(nowhere, origin, upright, joints)
         return Reading(
             joint_pos=joints,
             joint_vel=0.0 * joints,
@@ -346,11 +340,12 @@ class Controller:
             raise ValueError("it has only one of memory_in and memory_out")
         self.step(reading)  # with the memory of the first step
         self._has_begun = False
-        for name, entry in self.contract.get("objects", {}).items():
-            if "object_points" in self.shapes:
-                found = np.shape(entry["points"])
-                if found != self.shapes["object_points"]:
-                    raise ValueError(f"{name} has points of shape {found}")
+        for name, obj in self.contract.get("objects", {}).items():
+            for entry in _OF_OBJECT:
+                expected = self.shapes.get(f"object_{entry}")
+                found = np.shape(obj.get(entry))
+                if expected not in (None, found):
+                    raise ValueError(f"{name} has {entry} of shape {found}")
 
 
 def load_controller(policy: str | Path) -> Controller:

@@ -27,6 +27,7 @@ TASK = TaskConfig(
             goal_rotation={},
             gravity_fraction={},
             previous_action={},
+            tip_to_object={},
         ),
         proprio=Terms(
             joint_pos={"noise": 0.005},  # rad
@@ -39,7 +40,7 @@ TASK = TaskConfig(
             tip_force={"scale": 0.03},  # 1/N
             joint_target={},
         ),
-        perception=Terms(paired_cloud={"noise": 0.002, "scale": 5.0}),  # m, 1/m
+        perception=Terms(palm_cloud={"noise": 0.002, "scale": 5.0}),  # m, 1/m
         goal=Terms(goal_pos={}, goal_rotation={}, previous_action={}),
     ),
     reward=RewardConfig(

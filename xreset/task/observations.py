@@ -52,6 +52,8 @@ class ObservationInput:
     """[J]"""
     points: Tensor
     """[N, P, 3] surface points of each world's object, from its origin along the mesh frame's axes [m]."""
+    normals: Tensor
+    """[N, P, 3] outward unit normals of the surface at these points, along the mesh frame's axes."""
     observed_pos: Tensor
     """[N, 3] object position as the tracker reports it [m]: late, wrong, or old (``task.randomization``)."""
     observed_quat: Tensor
@@ -97,6 +99,11 @@ class ObservationInput:
     def world_points(self) -> Tensor:
         """[N, P, 3] the object's points in the world frame, at the pose that the tracker reports [m]."""
         return quat_rotate(self.observed_quat[:, None], self.points) + self.observed_pos[:, None]
+
+    @cached_property
+    def goal_points(self) -> Tensor:
+        """[N, P, 3] the object's points in the world frame, at the goal [m]."""
+        return quat_rotate(self.goal_quat[:, None], self.points) + self.goal_pos[:, None]
 
     @cached_property
     def to_nearest_point(self) -> Tensor:
@@ -321,9 +328,7 @@ def cloud(
 
 
 @TERMS.add
-def paired_cloud(
-    x: ObservationInput, *, noise: NonNegativeFloat, scale: PositiveFloat, palm: bool = False
-) -> Tensor:
+def paired_cloud(x: ObservationInput, *, noise: NonNegativeFloat, scale: PositiveFloat) -> Tensor:
     """[N, 1, P, 9] present position of every point, its position at the goal, and the goal's minus the present one (the
     published paper): the pose error point by point.
 
@@ -331,14 +336,28 @@ def paired_cloud(
         x: the step.
         noise: standard deviation of the points [m].
         scale: factor on all coordinates [1/m].
-        palm: in place of its position at the goal, each point has its position in the palm's frame. Not in the paper.
     """
     here = x.noisy(x.world_points, noise)
-    goal = quat_rotate(x.goal_quat[:, None], x.points) + x.goal_pos[:, None]
-    second = goal
-    if palm:
-        second = quat_rotate_inverse(x.links.quat[:, :1], here - x.links.pos[:, :1])
-    return scale * torch.cat((here, second, goal - here), dim=-1)[:, None]
+    goal = x.goal_points
+    return scale * torch.cat((here, goal, goal - here), dim=-1)[:, None]
+
+
+@TERMS.add
+def palm_cloud(x: ObservationInput, *, noise: NonNegativeFloat, scale: PositiveFloat) -> Tensor:
+    """[N, 1, P, 12] present position of every point, its position in the palm's frame, the way to its position at the
+    goal, and the surface's normal there in the palm's frame.
+
+    Args:
+        x: the step.
+        noise: standard deviation of the points [m].
+        scale: factor on all coordinates but the normals' [1/m].
+    """
+    here = x.noisy(x.world_points, noise)
+    palm = x.links.quat[:, :1]
+    of_palm = quat_rotate_inverse(palm, here - x.links.pos[:, :1])
+    normals = quat_rotate_inverse(palm, quat_rotate(x.observed_quat[:, None], x.normals))
+    points = scale * torch.cat((here, of_palm, x.goal_points - here), dim=-1)
+    return torch.cat((points, normals), dim=-1)[:, None]
 
 
 # For the critic -------------------------------------------------------------------------------------------------------
@@ -484,6 +503,7 @@ def _example(num_joints: int, num_tips: int, num_points: int) -> ObservationInpu
         joint_lower=joints[0],
         joint_upper=joints[0],
         points=zeros(num_points, 3),
+        normals=zeros(num_points, 3),
         observed_pos=zeros(3),
         observed_quat=zeros(4),
         goal_pos=zeros(3),

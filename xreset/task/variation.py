@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from xreset.errors import CapabilityError
-from xreset.physics import Backend, Parameter, Parameters, State
+from xreset.physics import Backend, Links, Parameter, Parameters, State
 from xreset.task.config import RandomizationConfig
 from xreset.task.latency import DelayLine
 from xreset.task.pushes import Pushes
@@ -25,6 +25,9 @@ from xreset.task.randomization import (
 )
 from xreset.task.tracker import Tracker
 from xreset.task.worlds import Sample, Worlds
+
+_OF_LINK = 13
+"""Numbers of a link: position, orientation and velocities."""
 
 
 class Variation:
@@ -76,7 +79,8 @@ class Variation:
         self.tracker = Tracker(worlds, c)
         age = partial(sample_range, n, c.proprio_latency)
         longest = c.longest("proprio_latency")
-        self._proprio = DelayLine(worlds, "proprio", proprio_width, longest, age)
+        width = proprio_width + _OF_LINK * len(backend.scene.robot.tracked_links)
+        self._proprio = DelayLine(worlds, "proprio", width, longest, age)
         self._lost_actions: Tensor | None = None
         if c.draws("lost_actions"):
             share = partial(sample_range, n, c.lost_actions)
@@ -161,12 +165,23 @@ class Variation:
         mass = self.parameters["object_mass"]
         return target + self.pushes.act(state, mass, inertia_scale, generator)
 
-    def observed_proprio(self, proprio: Tensor, fresh: Tensor) -> Tensor:
-        """[N, D] joints, links and forces as they are observed, possibly delayed.
+    def observed_proprio(
+        self, proprio: Tensor, links: Links, fresh: Tensor
+    ) -> tuple[Tensor, Links]:
+        """Return what a robot observes of itself, possibly delayed.
 
-        In the ``fresh`` worlds [N] the present values become the whole past.
+        Args:
+            proprio: [N, D] the observation group.
+            links: [N, 1 + E, ...] palm and fingertips, as late as the joints that they follow from.
+            fresh: [N] bool: worlds in which the present values become the whole past.
         """
         if not self._proprio.longest:
-            return proprio
-        self._proprio.fill(fresh, proprio)
-        return self._proprio.push(proprio, self._proprio.delay.round())
+            return proprio, links
+        of_links = torch.cat((links.pos, links.quat, links.linvel, links.angvel), dim=-1)
+        now = torch.cat((proprio, of_links.flatten(1)), dim=1)
+        self._proprio.fill(fresh, now)
+        late = self._proprio.push(now, self._proprio.delay.round())
+        proprio, of_links = late.split((proprio.shape[1], of_links[0].numel()), dim=1)
+        each = of_links.unflatten(1, (-1, _OF_LINK))
+        pos, quat, linvel, angvel = each.split((3, 4, 3, 3), dim=-1)
+        return proprio, Links(pos=pos, quat=quat, linvel=linvel, angvel=angvel)

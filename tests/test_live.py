@@ -427,7 +427,9 @@ class EngineTest(TestCase):
         act = Act(robot, task)
         memory = torch.zeros(2, observe.memory)
         known = known_of(toy_grasp.brick(), 64)
-        points, normals = (torch.as_tensor(known[n]).expand(2, -1, -1) for n in ("points", "normals"))
+        points, normals = (
+            torch.as_tensor(known[n]).expand(2, -1, -1) for n in ("points", "normals")
+        )
         with played.worlds(engine("mujoco", workers=0), torch.zeros(2, dtype=torch.long)) as env:
             env.reset(start=start)
             driver = EngineDriver(env)

@@ -174,7 +174,8 @@ class Sampling(TestCase):
 
     def test_normals_lead_out_of_the_solid(self):
         obj = load_object("scissors")
-        points, normals = surface_points(obj), surface_normals(obj)
+        points = surface_points(obj)
+        normals = surface_normals(obj)
         assert_allclose(np.linalg.norm(normals, axis=1), 1.0)
         assert_allclose(distance_to_pieces(points + 1e-3 * normals, obj.pieces), 1e-3, atol=3e-4)
         depth = winding_number(points - 1e-4 * normals, obj.vertices, obj.faces)

@@ -104,11 +104,12 @@ def _listed(objects: Sequence[ObjectSpec], cloud_points: int) -> dict[str, Any]:
 def known_of(obj: ObjectSpec, cloud_points: int) -> dict[str, np.ndarray]:
     """Return what a policy takes of an object: points [P, 3], the normals there [P, 3] and the center [3], in its frame
     and in single precision."""
-    return {
-        "points": np.float32(surface_points(obj, cloud_points)),
-        "normals": np.float32(surface_normals(obj, cloud_points)),
-        "center": np.float32(center(obj)),
+    known = {
+        "points": surface_points(obj, cloud_points),
+        "normals": surface_normals(obj, cloud_points),
+        "center": center(obj),
     }
+    return {name: value.astype(np.float32) for name, value in known.items()}
 
 
 def _joints(robot: RobotSpec, task: TaskConfig) -> list[dict[str, Any]]:

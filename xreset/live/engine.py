@@ -98,7 +98,9 @@ def begin_episodes(controller: Controller, env: ManipulationEnv) -> None:
     index = env.backend.object_index.tolist()
     count = controller.shapes.get("object_points", (1, 3))[0]
     known = [known_of(each, count) for each in objects]
-    of_worlds = {name: np.stack([each[name] for each in known])[index] for name in known[0]}
+    of_worlds = {}
+    for name in known[0]:
+        of_worlds[name] = np.stack([each[name] for each in known])[index]
     goal = (_array(env.goal_pos), _array(env.goal_quat))
     controller.begin(of_worlds, *goal, _array(env.joint_target))
 

@@ -85,8 +85,8 @@ def sample_surface(
 
 
 def farthest_points(points: np.ndarray, count: int) -> np.ndarray:
-    """[count] indices of points [N, 3] chosen one after another, each the farthest from those chosen before; the first is
-    the farthest from the mean."""
+    """[count] indices of points [N, 3], chosen one after another: the farthest from the mean, then each time the
+    farthest from those chosen before."""
     if len(points) < count:
         raise ObjectError(
             f"Only {len(points)} of {count} points are on the outside of the mesh. Repair it, for example in MeshLab."

@@ -119,7 +119,7 @@ def _wrong_values(contract: dict[str, Any]) -> Iterator[tuple[str, Any, str]]:
         for part, dimensions in (("points", 2), ("normals", 2), ("center", 1)):
             value = entry.get(part) if isinstance(entry, dict) else None
             if part == "normals" and value is None:
-                continue  # as in policies of xreset 0.4 or earlier
+                continue  # policies of xreset 0.3 have none
             if not _is_coordinates(value, dimensions):
                 yield f"objects.{name[:60]}.{part}", value, "coordinates in metres"
 

@@ -2,22 +2,22 @@
 
 import itertools
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
-from unittest import TestCase
+from unittest import TestCase, mock
 
 import numpy as np
-import trimesh
 from numpy.testing import assert_allclose
 
 from tests.engine_checks import EngineChecks
 from xreset.backends.conformance import run
 from xreset.backends.conformance.scene import gripper, objects, scene, shape, solid
-from xreset.backends.rigid import TABLE, friction_forces, mechanism
+from xreset.backends.rigid import friction_forces, mechanism
 from xreset.backends.sapien import _PARTING_SPEED, SapienBackend, SapienWorld
-from xreset.backends.sapien_robot import OBJECT_BIT, _couple, self_collision_bits
+from xreset.backends.sapien_robot import _couple, self_collision_bits
 from xreset.errors import RobotError
 from xreset.geometry.description import load_robot
-from xreset.spec import GRAVITY, Geometry, MimicSpec, SceneSpec, Shape
+from xreset.spec import GRAVITY, MimicSpec, SceneSpec
 
 
 class SapienTest(EngineChecks, TestCase):
@@ -75,22 +75,15 @@ class SapienTest(EngineChecks, TestCase):
         world.set_state(state)
         world.step(1)
 
-    def test_a_ball_is_pushed_off_the_rim_of_a_hull(self):
-        """In metres, PhysX missed 16 of these 64 contacts."""
-        world = self.world(solid("ball", 0.4, (shape("sphere", (0.012,)),)))
-        can = trimesh.creation.cylinder(0.033, 0.1, sections=32)
-        hull = Geometry(kind="hull", vertices=can.vertices, faces=can.faces)
-        body = world._sapien.physx.PhysxRigidStaticComponent()
-        world._attach(body, Shape(geometry=hull), TABLE, (0, OBJECT_BIT))
-        world._add(body, "can", world._pose([0.4, 0.3, 0.5]))
-        world._scene.add_entity(world._entities[-1])
-        for angle in np.linspace(0.0, 2.0 * np.pi, 64, endpoint=False):
-            # 2 mm deep
-            out = 0.033 * np.cos(np.pi / 32) + 0.007
-            place = np.array([0.4 + out * np.cos(angle), 0.3 + out * np.sin(angle), 0.557])
-            self.put(world, place)
-            moved = world.get_state()["object_pos"] - place
-            self.assertGreater(np.linalg.norm(moved), 1e-3, angle)
+    def test_rims_of_hulls_are_missed_in_metres(self):
+        """By PhysX. Another unit of length hides this, and the suite finds it."""
+        with (
+            mock.patch("xreset.backends.sapien.LENGTH", 1.0),
+            mock.patch("xreset.backends.sapien_robot.LENGTH", 1.0),
+        ):
+            (result,) = run(partial(SapienBackend, workers=0), only=["pressing"])
+        failed = [measure.what for measure in result.measures if measure.verdict == "failed"]
+        self.assertEqual(failed, ["rims that are missed"])
 
     def test_the_number_of_steps_before_a_reset_changes_no_bit(self):
         world = self.world(objects()[0], load_robot("openarm"))

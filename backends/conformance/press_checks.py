@@ -14,8 +14,10 @@ from torch import Tensor
 from xreset.backends.conformance.harness import SETTLE, Bench, Worlds
 from xreset.backends.conformance.results import Measured, Skipped
 from xreset.backends.conformance.robot_checks import with_drives
-from xreset.backends.conformance.scene import flat_objects, presser
+from xreset.backends.conformance.scene import flat_objects, presser, tin
 from xreset.errors import CapabilityError
+from xreset.geometry.kinematics import Kinematics
+from xreset.geometry.rotations import matrix_to_quat
 from xreset.physics import State
 from xreset.spec import GRAVITY, RobotSpec, SceneSpec
 
@@ -27,11 +29,13 @@ _GAP = 0.001  # m between a foot that does not touch and the object
 _FRICTIONS = ((0.4, 0.7, 0.9), (0.6, 0.3, 0.5))  # each of the three is once the largest of a pair
 _DRAG = 0.01  # m/s
 _PUSH = 0.2  # m/s
+_CAPSULE = 0.008  # m, the radius of the palm
+_TINS = 64
 
 
 def pressing(bench: Bench) -> Measured:
     """Press on an object on the table with a thumb, an index finger and another link; only that one must be reported,
-    and none from 1 mm above the object.
+    and none from 1 mm above the object. Then throw tins with their rims against a capsule: it must be reported.
 
     The drive presses with kp (q - target), and the table carries that and the object's weight.
     """
@@ -61,6 +65,7 @@ def pressing(bench: Bench) -> Measured:
         wrong = (contacts.tip_touch[0] != pressing).float()
         errors[f"{role}: fingers wrong about a touch"] = zip(tips, wrong)
         errors[f"{role}: fingers that touch from afar"] = zip(tips, apart.tip_touch[0].float())
+    errors["rims that are missed"] = _missed_rims(bench)
     return errors
 
 
@@ -178,6 +183,33 @@ def joint_friction(bench: Bench) -> Measured:
         "way against friction": (signed[:, :2] - way[:, None]) / 0.02,
         "way within friction": signed[:, 2:] / 0.003,
     }
+
+
+def _missed_rims(bench: Bench) -> Tensor:
+    """Return how many tins touch a capsule with an edge or a corner of their rim, 0.3 mm deep, and are not reported."""
+    hull = tin()
+    scene = replace(bench.scene, robot=presser(thumb=("palm",)), objects=(hull,))
+    object_index = [0] * _TINS
+    start = State.initial(scene, torch.tensor(object_index))
+    kinematics = Kinematics(scene.robot)
+    center = kinematics.points(kinematics.home, ["palm"])[0]
+    for i in range(_TINS):
+        # in the frame of the tin: the direction to the capsule, and the axis of the capsule
+        angle = 2 * np.pi * i / _TINS
+        out = np.array([np.cos(angle), np.sin(angle), 1.0]) / np.sqrt(2.0)
+        tangent = np.array([-np.sin(angle), np.cos(angle), 0.0])
+        axis = np.cos(i) * tangent + np.sin(i) * np.cross(out, tangent)
+        height = hull.vertices @ out
+        rim = hull.vertices[height > height.max() - 1e-9].mean(axis=0)
+        # in the world, the capsule is along z, and the tin comes from the other side of x
+        turn = np.stack((out, np.cross(axis, out), axis))
+        reach = turn @ rim + np.array([_CAPSULE - 3e-4, 0.0, 0.0])
+        start.object_pos[i] = center - torch.tensor(reach)
+        start.object_quat[i] = matrix_to_quat(torch.tensor(turn))
+    start.object_linvel[:, 0] = _PUSH
+    with bench.other(scene, object_index) as worlds:
+        worlds.advance(start, 1)
+        return (~worlds.contacts().tip_touch[:, 0]).float().sum()
 
 
 def _scene(bench: Bench, robot: RobotSpec) -> SceneSpec:

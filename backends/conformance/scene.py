@@ -29,7 +29,7 @@ def presser(**contact_links: tuple[str, ...]) -> RobotSpec:
     """Return a foot that slides along x and presses down, next to a shelf on its base.
 
     Args:
-        contact_links: finger, ``thumb`` or ``index`` -> which links are its own, of ``foot`` and ``shelf``.
+        contact_links: finger, ``thumb`` or ``index`` -> which links are its own, of ``foot``, ``shelf`` and ``palm``.
     """
     robot = read_description(Path(__file__).with_name("presser.toml"))
     tips = []
@@ -64,6 +64,14 @@ def flat_objects() -> tuple[ObjectSpec, ...]:
         solid("two hulls", 0.4, halves),
         solid("cylinder", 0.4, (shape("cylinder", (0.06, 0.02)),)),
     )
+
+
+@cache
+def tin() -> ObjectSpec:
+    """Return a tin of 40 mm diameter and 30 mm height, a hull with 16 sides."""
+    vertices, faces = mesh_arrays(trimesh.creation.cylinder(0.02, 0.03, sections=16))
+    hull = Geometry(kind="hull", vertices=vertices, faces=faces)
+    return solid("tin", 0.3, (Shape(geometry=hull),))
 
 
 @cache

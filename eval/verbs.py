@@ -27,7 +27,7 @@ from xreset.files.progress import NamedProgress, Progress, unseen
 from xreset.files.records import replaces
 from xreset.files.storage import claim_folder, must_be_new
 from xreset.files.text import quantity, texts
-from xreset.physics.plugins import Device
+from xreset.physics.plugins import Device, EngineName, RobotName
 
 if TYPE_CHECKING:
     from xreset.eval.export.recorded import RecordedEpisodes
@@ -46,11 +46,11 @@ _warn = logging.getLogger(__name__).warning
 def evaluate(
     policy: str | Path | PolicySpec,
     demos: str | Path | Data,
-    engine: str | Engine | Sequence[str | Engine] = "mujoco",
+    engine: EngineName | Engine | Sequence[EngineName | Engine] = "mujoco",
     *,
     episodes: PositiveInt = 5,
     episode_seconds: float | None = None,
-    robot: str | Path | None = None,
+    robot: RobotName | None = None,
     meshes: str | Path | None = None,
     seed: Seed = 0,
     device: Device = "cpu",
@@ -117,12 +117,12 @@ def evaluate(
 def stress(
     policy: str | Path | PolicySpec,
     demos: str | Path | Data | None = None,
-    engine: str | Engine | Sequence[str | Engine] = "mujoco",
+    engine: EngineName | Engine | Sequence[EngineName | Engine] = "mujoco",
     *,
     properties: Annotated[str | Sequence[str], Option("property")] = (),
     faults: bool = False,
     episodes: PositiveInt = 2,
-    robot: str | Path | None = None,
+    robot: RobotName | None = None,
     meshes: str | Path | None = None,
     seed: Seed = 0,
     device: Device = "cpu",
@@ -211,7 +211,7 @@ def make_report(
     runs: str | Path | Sequence[str | Path],
     out: Annotated[Output, replaces("xreset-report", "index.html")] | None = None,
     *,
-    robot: str | Path | None = None,
+    robot: RobotName | None = None,
     meshes: str | Path | None = None,
     film: Mp4 | None = None,
     progress: NamedProgress = unseen,
@@ -337,7 +337,7 @@ def export_deploy(
     policy: str | Path | PolicySpec,
     out: Output,
     *,
-    robot: str | Path | None = None,
+    robot: RobotName | None = None,
     meshes: str | Path | None = None,
     only: Annotated[Sequence[str], Option("object")] = (),
 ) -> Path:
@@ -380,7 +380,7 @@ def export_episodes(
     out: Annotated[Output, replaces("xreset-rollouts/")],
     *,
     engine: str | Sequence[str] = (),
-    robot: str | Path | None = None,
+    robot: RobotName | None = None,
     meshes: str | Path | None = None,
     task: str | None = None,
     video: bool = True,
@@ -433,8 +433,8 @@ def play(
     policy: str | Path | PolicySpec | None = None,
     *,
     object_name: Annotated[str | None, Option("object")] = None,
-    engine: str = "mujoco",
-    robot: str | Path | None = None,
+    engine: EngineName = "mujoco",
+    robot: RobotName | None = None,
     demos: str | Path | None = None,
     meshes: str | Path | None = None,
     host: str = "127.0.0.1",

@@ -159,10 +159,13 @@ class UsageTest(TestCase):
             (r"--out is 'x', expected a name that ends in \.json or \.md", "engines check --out x"),
             (r"--out is 'x\.md', expected", "engines compare x.npz --out x.md"),
             (r"--picture is 'x\.jpg', expected", "robots check openarm --picture x.jpg"),
-            (r"--out is '\.', expected a file, not a folder", "retarget d.npz --robot x --out ."),
+            (
+                r"--out is '\.', expected a file, not a folder",
+                "retarget d.npz --robot openarm --out .",
+            ),
             (
                 r"cannot write /dev/null/x\.npz: /dev/null is a file, expected a folder",
-                "goals nothing --robot x --out /dev/null/x.npz",
+                "goals nothing --robot openarm --out /dev/null/x.npz",
             ),
             (r"/dev/null/run: /dev/null is a file", "train --resets d.npz --out /dev/null/run"),
             (

@@ -149,7 +149,7 @@ class Judge(InFolder):
     def test_a_weak_grip_drops_in_the_command(self):
         self.enterContext(toy_grasp.found())
         write_bank(f"{self.folder}/bank.npz", bank())
-        words = "--robot gripper --engine mujoco --squeeze.force 0.2 --picture"
+        words = "--engine mujoco --squeeze.force 0.2 --picture"
         picture = self.folder / "judge.png"
         said = succeeds("robots judge", self.folder / "bank.npz", words, picture)
         self.assertRegex(said, r"brick +│ +3 +│ 0, 0, 0")
@@ -158,8 +158,8 @@ class Judge(InFolder):
         self.assertIn("demonstrations in reach): brick 0%", said)
         self.assertEqual(Image.open(picture).size[0], 4 * judging._TILE[0])
         with patch.object(judging, "try_grasps", side_effect=RobotError("tried")) as tried:
-            refused("robots judge", self.folder / "bank.npz", "--robot gripper")
+            refused("robots judge", self.folder / "bank.npz")
             self.assertIn("mujoco", tried.call_args.args[3])
             self.assertNotIn("mujoco-warp", tried.call_args.args[3], "it is slow on a CPU")
-            refused("robots judge", self.folder / "bank.npz", "--robot gripper --engine mujoco")
+            refused("robots judge", self.folder / "bank.npz", "--engine mujoco")
             self.assertEqual([*tried.call_args.args[3]], ["mujoco"])

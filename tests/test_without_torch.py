@@ -85,3 +85,22 @@ class WithoutTorchTest(InFolder):
             self.assertTrue((self.folder / "on_robot" / name / "policy.onnx").exists(), name)
         self.assertIn("page: page", found)
         self.assertTrue((self.folder / "page" / "index.html").exists())
+
+    def test_wrong_names_are_refused(self):
+        """Before torch loads, which takes seconds."""
+        refusals = {
+            "run x.npz --out run --robot none": "Unknown robot 'none'",
+            "run x.npz --out run --robot openarm --engine mujoco --engine none": "engine 'none'",
+            "train --resets x.npz --out run --robot none": "Unknown robot 'none'",
+            "train --resets x.npz --out run --engine none": "Unknown engine 'none'",
+            "train --resets x.npz --out run --recipe none": "no recipe, file, run folder or",
+            "eval zero --demos x.npz --robot none": "Unknown robot 'none'",
+            "eval zero --demos x.npz --engine none": "Unknown engine 'none'",
+            "engines check --engine none": "Unknown engine 'none'",
+        }
+        code = "from xreset.cli import main\nsys.stderr = sys.stdout\n"
+        for command in refusals:
+            code += f"try: main({command.split()!r})\nexcept SystemExit: pass\n"
+        said = self.run_blocked(code).splitlines()
+        for refusal, line in zip(refusals.values(), said, strict=True):
+            self.assertIn(refusal, line)

@@ -16,7 +16,7 @@ from xreset.files.progress import NamedProgress, unseen
 from xreset.files.records import replaces
 from xreset.files.storage import file_hash, measured, write_json, write_whole
 from xreset.files.text import texts
-from xreset.physics.plugins import Device, backend_class
+from xreset.physics.plugins import Device, EngineName, RobotName, backend_class
 
 if TYPE_CHECKING:
     from xreset.eval.engines.agreement import Parity
@@ -27,9 +27,9 @@ else:  # a command has texts in place of these
 
 @obeys_rules
 def check_engines(
-    engine: Annotated[str | Sequence[str], Option("engine")],
+    engine: Annotated[EngineName, Option("engine")] | Sequence[EngineName],
     *,
-    robot: str | Path | None = None,
+    robot: RobotName | None = None,
     device: Device = "cpu",
     only: Annotated[Sequence[str], Option("check")] = (),
     out: Annotated[JsonOrPage, replaces("xreset-")] | None = None,
@@ -73,9 +73,9 @@ def check_engines(
 @obeys_rules
 def compare_engines(
     motion: str | Path,
-    engine: str | Engine | Sequence[str | Engine],
+    engine: EngineName | Engine | Sequence[EngineName | Engine],
     *,
-    robot: str | Path | None = None,
+    robot: RobotName | None = None,
     meshes: str | Path | None = None,
     names: Annotated[Sequence[str], Option("object")] = (),
     grasps: PositiveInt = 48,

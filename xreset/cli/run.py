@@ -17,7 +17,7 @@ from xreset.files.records import stated_inputs
 from xreset.files.storage import claim_folder, file_hash
 from xreset.files.text import quantity, texts
 from xreset.learning.run import read_run
-from xreset.physics.plugins import Device, backend_class, robot_names
+from xreset.physics.plugins import Device, EngineName, RobotName, backend_class, robot_names
 from xreset.policy.shipped import shipped_checkpoints, shipped_name
 
 _MINUTES = 25.0
@@ -36,10 +36,10 @@ OpenArm takes about half of them."""
 def run(
     demos: str | Path,
     *,
-    robot: str | Path,
+    robot: RobotName,
     out: str | Path,
     meshes: str | Path | None = None,
-    engine: str | Sequence[str] = (),
+    engine: EngineName | Sequence[EngineName] = (),
     recipe: str | None = None,
     weights: str | Path | None = None,
     device: Device | None = None,

@@ -17,7 +17,7 @@ from xreset.files.checks import Option, Output, PositiveFloat, PositiveInt, Seed
 from xreset.learning.config import TrainConfig
 from xreset.learning.recipes import for_robots, from_home, starting_config
 from xreset.learning.run import RobotData, RunInfo, checkpoints, read_run
-from xreset.physics.plugins import Device, backend_class, device_for
+from xreset.physics.plugins import Device, EngineName, RobotName, backend_class, device_for
 
 if TYPE_CHECKING:
     from xreset.resets.bank import ResetBank
@@ -38,10 +38,10 @@ def train(
     bank: Annotated[str | Path | ResetBank | Sequence[str | Path] | None, Option("resets")] = None,
     *,
     out: Output,
-    robot: str | Path | None = None,
+    robot: RobotName | None = None,
     goals: str | Path | GoalSet | None = None,
     meshes: str | Path | None = None,
-    engine: str | None = None,
+    engine: EngineName | None = None,
     device: Device | None = None,
     num_envs: PositiveInt | None = None,
     iterations: PositiveInt | None = None,

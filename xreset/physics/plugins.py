@@ -67,18 +67,25 @@ def load_plugin(group: str, name: str) -> Any:
         BackendUnavailableError, RobotError: depending on the group: no plugin has that name, or it does not load.
     """
     noun, error_class = _KINDS[group]
-    entries = plugins(group)
-    if name not in entries:
-        raise error_class(f"Unknown {noun} {shown(name)}. Choose from: {known_plugins(group)}.")
+    entry = _entry(group, name)
     try:
-        return entries[name].load()
+        return entry.load()
     except XResetError:
         raise
     except Exception as error:  # a plugin may fail in any way; the others must still work
         trace = traceback.format_exc(limit=-2)
         raise error_class(
-            f"the {noun} {name!r} ({entries[name].value}) does not load: {error}\n{trace}"
+            f"the {noun} {name!r} ({entry.value}) does not load: {error}\n{trace}"
         ) from error
+
+
+def _entry(group: str, name: str) -> EntryPoint:
+    """Return the plugin of a name, without loading it; see :func:`load_plugin` for the error."""
+    noun, error_class = _KINDS[group]
+    entries = plugins(group)
+    if name not in entries:
+        raise error_class(f"Unknown {noun} {shown(name)}. Choose from: {known_plugins(group)}.")
+    return entries[name]
 
 
 def known_plugins(group: str) -> str:
@@ -123,6 +130,15 @@ def robot_folder(name_or_folder: str | Path) -> Path:
     return Path(module.__file__).resolve().parent
 
 
+def _refuse_unknown_robot(robot: object) -> None:
+    if isinstance(robot, str | Path):  # not one that is loaded
+        robot_folder(robot)
+
+
+RobotName = Annotated[str | Path, Check(_refuse_unknown_robot)]
+"""Registered name or folder of a robot, in the annotation of an argument: a wrong one is refused before torch loads."""
+
+
 def robot_of_file(file: str | Path, *stated: str) -> str:
     """Return the first name of a registered robot, or folder of another one, that a file states and that is here; see
     :func:`stated_path`. If none is, the last one is returned."""
@@ -152,6 +168,18 @@ class BackendStatus:
 def backend_names() -> list[str]:
     """Return the names of all registered engines, in order of registration."""
     return list(plugins(ENGINES))
+
+
+def _refuse_unknown_engines(engines: object) -> None:
+    """Refuse the names of engines that are not registered. What is no name, such as an engine with options, passes."""
+    for engine in engines if isinstance(engines, list | tuple) else (engines,):
+        if isinstance(engine, str):
+            _entry(ENGINES, engine)
+
+
+EngineName = Annotated[str, Check(_refuse_unknown_engines)]
+"""Registered name of an engine, alone or next to several, in the annotation of an argument: a wrong one is refused
+before torch loads."""
 
 
 def backend_class(name: str) -> type[Backend]:

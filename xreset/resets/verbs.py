@@ -17,7 +17,7 @@ from xreset.files.checks import Option, OutputFile, PositiveInt, Seed, obeys_rul
 from xreset.files.progress import NamedProgress, Progress, unseen
 from xreset.files.records import replaces
 from xreset.files.text import shown, texts
-from xreset.physics.plugins import Device, backend_class
+from xreset.physics.plugins import Device, EngineName, RobotName, backend_class
 from xreset.resets.config import ClosingConfig, FilterConfig, SqueezeConfig, TransferConfig
 
 if TYPE_CHECKING:
@@ -35,9 +35,9 @@ Pose = tuple[float, float, float, float, float, float, float]
 @obeys_rules
 def make_bank(
     retargeted: str | Path | Retargeted,
-    robot: str | Path | RobotSpec | None = None,
+    robot: RobotName | RobotSpec | None = None,
     objects: Sequence[ObjectSpec] | None = None,
-    engine: str | Sequence[str] = "mujoco",
+    engine: EngineName | Sequence[EngineName] = "mujoco",
     *,
     out: Annotated[OutputFile, replaces("xreset-resets/")] | None = None,
     meshes: str | Path | None = None,
@@ -154,7 +154,7 @@ def make_bank(
 def make_goals(
     names: Sequence[str] | None = None,
     *,
-    robot: str | Path | RobotSpec,
+    robot: RobotName | RobotSpec,
     out: Annotated[OutputFile, replaces("xreset-goals/")] | None = None,
     meshes: str | Path | None = None,
     families: Annotated[str | Sequence[str] | None, Option("family")] = None,

@@ -15,7 +15,7 @@ from xreset.files.checks import Option, OutputFile, obeys_rules
 from xreset.files.progress import Progress, unseen
 from xreset.files.records import replaces
 from xreset.files.storage import file_hash
-from xreset.physics.plugins import Device
+from xreset.physics.plugins import Device, RobotName
 
 if TYPE_CHECKING:
     from xreset.demos.archive import Demos
@@ -31,7 +31,7 @@ _warn = logging.getLogger(__name__).warning
 @obeys_rules
 def retarget_demos(
     demos: str | Path | Demos,
-    robot: str | Path | RobotSpec,
+    robot: RobotName | RobotSpec,
     objects: Sequence[ObjectSpec] | None = None,
     config: RetargetConfig | None = None,
     *,

@@ -15,7 +15,7 @@ from xreset.files.checks import Option, Output, Png, PositiveInt, obeys_rules
 from xreset.files.progress import NamedProgress, Progress, unseen
 from xreset.files.storage import this_command
 from xreset.files.text import texts
-from xreset.physics.plugins import Device
+from xreset.physics.plugins import Device, EngineName, RobotName
 from xreset.resets.config import SqueezeConfig
 from xreset.robot_tools.placement import Finalist, PlaceConfig, write_placement
 
@@ -167,9 +167,9 @@ def place_robot(
 @obeys_rules
 def judge(
     bank: str | Path | ResetBank,
-    robot: str | Path | RobotSpec | None = None,
+    robot: RobotName | RobotSpec | None = None,
     objects: Sequence[ObjectSpec] | None = None,
-    engine: str | Sequence[str] = "mujoco",
+    engine: EngineName | Sequence[EngineName] = "mujoco",
     *,
     meshes: str | Path | None = None,
     states: PositiveInt = 8,

@@ -148,6 +148,12 @@ def chosen_properties(
     return tuple(found.values()) or tuple(default)
 
 
+def plays_on_robot(properties: str | Sequence[str], faults: bool) -> bool:
+    """Return whether a robot's control loop plays: faults are asked for, or a property is one; see
+    :func:`chosen_properties` for errors."""
+    return any(prop.is_fault for prop in chosen_properties(properties)) or faults
+
+
 def _values(text: str, values: str, prop: Property) -> tuple[float, ...]:
     try:
         numbers = sorted({float(v) for v in values.split(",")} - {prop.nominal})

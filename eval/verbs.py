@@ -13,7 +13,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from xreset.errors import RunError, XResetError
-from xreset.eval.conditions import FAULTS, SWEPT, Condition, chosen_properties, nominal_task
+from xreset.eval.conditions import (
+    FAULTS,
+    SWEPT,
+    Condition,
+    chosen_properties,
+    nominal_task,
+    plays_on_robot,
+)
 from xreset.files.checks import (
     Mp4,
     Option,
@@ -150,12 +157,12 @@ def stress(
         seed: seed of starts and faults, which are the same in every engine.
         device: where engines run that can use a GPU: cpu or cuda.
         num_envs: worlds that run at the same time.
-        out: folder for the results; default: stress/ in the run folder or next to the policy, faults/ if there are
-            faults.
+        out: folder for the results; the command's default: stress/ in the run folder or next to the policy, faults/ if
+            there are faults.
         progress: called with (engine, conditions done, conditions in all).
 
     Returns:
-        The results that were written, in the order of the engines: the unchanged episodes, and those of every value.
+        The results in the order of the engines: the unchanged episodes, and those of every value.
         :mod:`xreset.eval.effects` compares them.
 
     Raises:
@@ -163,7 +170,7 @@ def stress(
         XResetError: a property is unknown or cannot have a value; nothing was played then.
     """
     wanted = chosen_properties(properties, FAULTS if faults else SWEPT)
-    on_robot = faults or any(prop.is_fault for prop in wanted)
+    on_robot = plays_on_robot(properties, faults)
     if on_robot and any(prop.in_steps for prop in wanted):
         raise XResetError(
             "A robot's control loop, which plays faults, has no latencies of the task. Choose action-delay in place of "
@@ -193,13 +200,12 @@ def stress(
     for prop in wanted:
         tried = [prop.at(value, task) for value in prop.values]
         conditions += {condition.value: condition for condition in tried}.values()
-    default = spec.folder.parent / ("faults" if on_robot else "stress")
     return experiment.play(
         spec,
         trial,
         chosen,
         conditions,
-        Path(out) if out else default,
+        Path(out) if out else None,
         episodes=episodes,
         on_robot=on_robot,
         progress=progress,

@@ -190,9 +190,9 @@ class StoppedTest(InFolder):
         steps = round(policy.task.termination.episode_seconds / policy.task.control_dt)
         measure = Round.update_metrics
         with patch.object(Round, "update_metrics", autospec=True, side_effect=measure) as measured:
-            (found,) = stress(
-                policy, demos, properties="lost-frames=1.2", episodes=1, out=self.folder
-            )
+            results = stress(policy, demos, properties="lost-frames=1.2", episodes=1)
+        self.assertIsNone(results.folder)  # nothing was asked to be written
+        (found,) = results
         self.assertEqual(list(found.stopped.values()), [1])
         self.assertEqual(measured.call_count, 2 * steps)
 

@@ -1,5 +1,6 @@
 """Sweeps of one property at a time: what is swept, what is found, and what is refused. No physics but for one short run."""
 
+import shutil
 from dataclasses import replace
 from unittest import TestCase
 from unittest.mock import patch
@@ -16,6 +17,7 @@ from xreset.eval.conditions import PROPERTIES, SWEPT, chosen_properties, nominal
 from xreset.eval.effects import by_property, curves, verdict
 from xreset.eval.results import read_evaluation
 from xreset.files.storage import claim
+from xreset.policy.shipped import shipped
 from xreset.task.config import RandomizationConfig, TaskConfig, evaluation_task
 
 
@@ -146,6 +148,19 @@ class CurveTest(TestCase):
 
 
 class CommandTest(InFolder):
+    def test_results_are_next_to_the_policy_by_default(self):
+        run = self.folder / "run"
+        run.mkdir()
+        policy = shutil.copy(shipped()["many-objects"], run)
+        for options, folder in (
+            ("--property object-mass=2", "stress"),
+            ("--property lost-frames=1", "faults"),
+            ("--faults", "faults"),
+        ):
+            with patch("xreset.eval.experiment.play", side_effect=KeyboardInterrupt) as played:
+                xreset("stress", policy, "--engine mujoco", options)
+            self.assertEqual(played.call_args.args[4], run / folder)
+
     def test_an_unknown_engine_is_refused_before_demonstrations_are_made(self):
         with patch("xreset.demos.verbs.synthesize") as made:
             self.assertIn("Unknown engine", refused("stress openarm --engine none"))

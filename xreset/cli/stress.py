@@ -8,11 +8,22 @@ from typing import TYPE_CHECKING, Any
 from xreset.cli._terminal import console, show_table
 from xreset.cli._verbs import verb
 from xreset.eval import verbs
+from xreset.eval.conditions import plays_on_robot
 from xreset.files.text import quantity
 
 if TYPE_CHECKING:
     from xreset.eval import effects
     from xreset.eval.results import Evaluation
+
+
+def _write_into_default_folder(arguments: dict[str, Any]) -> None:
+    if arguments["out"] is None:
+        has_faults = plays_on_robot(arguments.get("properties", ()), arguments["faults"])
+        from xreset.eval.policy_spec import load_policy
+
+        policy = load_policy(arguments["policy"], robot=arguments["robot"])
+        arguments["policy"] = policy
+        arguments["out"] = policy.folder.parent / ("faults" if has_faults else "stress")
 
 
 def _show(found: Evaluation, _options: Mapping[str, Any]) -> None:
@@ -55,4 +66,4 @@ def _cell(curve: effects.Curve, index: int) -> str:
     return f"{text}, {points_text(point.difference, *point.difference_ci95)}"
 
 
-COMMAND = verb(verbs.stress, _show)
+COMMAND = verb(verbs.stress, _show, prepare=_write_into_default_folder)

@@ -203,6 +203,10 @@ class UsageTest(TestCase):
                 self.assertRegex(err + out, words)
                 self.assertNotIn("Traceback", err)
 
+    def test_an_option_of_a_group_is_named_as_it_was_given(self):
+        _, out, err = run("train --resets x.npz --out x --config.ppo.sequence-length 7")
+        self.assertIn("config.ppo: sequence-length is 7", out + err)
+
     def test_a_word_in_place_of_a_number_is_named(self):
         for flag, words in (
             ("--iterations 1e3", "found '1e3', expected a whole number"),

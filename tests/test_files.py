@@ -555,7 +555,7 @@ class TypedTest(TestCase):
         ):
             with self.subTest(version), self.assertRaises(FileFormatError) as caught:
                 from_dict(Inner, {"size": 1.0, "sise": 2.0}, "a.json", version)
-            expected = "a.json does not fit Inner (unknown: sise (size?); known: size, mode)."
+            expected = "a.json has wrong entries (unknown: sise (size?); known: size, mode)."
             if is_newer:
                 expected += (
                     f"\nIt was written by xreset {version!r}, and this is xreset {__version__}. "
@@ -569,7 +569,7 @@ class TypedTest(TestCase):
             ("unknown: extra", good | {"extra": 1}),
             ("missing: pair", {k: v for k, v in good.items() if k != "pair"}),
             (
-                "configuration.inner does not fit Inner.*missing: size",
+                "configuration.inner has wrong entries.*missing: size",
                 good | {"inner": {"mode": "b"}},
             ),
             (

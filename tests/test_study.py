@@ -59,7 +59,7 @@ class FileTest(Studied):
         for text, message in (
             (
                 f"{a}minuets = 3",
-                r"runs\.a does not fit Runs \(unknown: minuets \(minutes\?\); known: minutes, data, .*\)\.$",
+                r"runs\.a has wrong entries \(unknown: minuets \(minutes\?\); known: minutes, data, .*\)\.$",
             ),
             (f"{a}worlds = 3", r"\(unknown: worlds; known: data, .*, num_envs\)\.$"),
             (f"{a}seeds = [0, 0]", r"runs\.a\.seeds is \[0, 0\], expected one or more"),

@@ -281,11 +281,11 @@ class RewardTest(TestCase):
             (f"{__name__}:IDENTITY", {}, RunError, "test_task.py has no function 'IDENTITY'"),
             (f"{__name__}:one_number", {}, RunError, r"gave \(\). Return a tensor of shape \(1,\)"),
             (f"{__name__}:misspelt", {}, RunError, r"line \d+ of .*test_task.py: AttributeError: .*'object_position'"),
-            (f"{__name__}:height", {"most": 1.0}, ValueError, r"height does not fit height .unknown: most; known: "),
+            (f"{__name__}:height", {"most": 1.0}, ValueError, r"height has wrong entries .unknown: most; known: "),
             ("raech", {"width": 1.0}, ValueError, "Unknown reward term 'raech'. One of your own is named module:function. Choose from: reach, best_reach"),
             ("reach", {"width": -1.0}, ValueError, r"terms\.reach\.width is -1.0, expected a number above 0"),
             ("reach", {"width": 1.0, "with": 1.0}, ValueError, "unknown: with .width\\?.; known: width"),
-            ("reach", {}, ValueError, r"terms\.reach does not fit reach .missing: width"),
+            ("reach", {}, ValueError, r"terms\.reach has wrong entries .missing: width"),
         ):  # fmt: skip
             with self.subTest(name, **term), self.assertRaisesRegex(error, problem):
                 self.reward(RewardConfig(terms={name: {"weight": 1.0} | term}))
@@ -1333,7 +1333,7 @@ class ObservationTest(TestCase):
             (
                 "joint_vel",
                 {"noise": 0.1},
-                r"policy\.joint_vel does not fit joint_vel .missing: scale",
+                r"policy\.joint_vel has wrong entries .missing: scale",
             ),
             ("tip_force", {"scale": "x"}, r"policy\.tip_force\.scale is 'x', expected a number"),
         ):

@@ -401,8 +401,11 @@ class TrainingTest(WithBank):
             ('extends = "nothing"', "extends is 'nothing'. Choose from: default"),
             ('replaces = ["task.nothing"]', "expected a list of names of tables"),
             ("replaces = 3", "expected a list of names of tables"),
-            ("ppo.entropyy = 1.0", "mine.toml.ppo does not fit.*entropy"),
-            ("ppo = 3", "mine.toml.ppo is 3, expected"),
+            ("ppo.entropyy = 1.0", "mine.toml.ppo has wrong entries .unknown: entropyy"),
+            (
+                "ppo = 3",
+                "mine.toml.ppo is 3, expected an object with the entries horizon, .*entropy",
+            ),
             ('iterations = "many"', "iterations is 'many', expected"),
             ("x =", "is not valid TOML"),
         ):

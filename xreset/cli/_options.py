@@ -26,7 +26,7 @@ from tyro.constructors import (
     StructTypeInfo,
 )
 
-from xreset.errors import XResetError
+from xreset.errors import WrongValueError, XResetError
 from xreset.files.checks import Options, Written, check_value, marks_in, marks_of
 from xreset.files.storage import INVOCATION, claim
 
@@ -202,7 +202,17 @@ def _group(info: StructTypeInfo) -> StructConstructorSpec | None:
         elif field.default in ((), {}):
             kind = _without_default(kind)
         fields.append(replace(field, type=kind, helptext=" ".join(text.split()) if text else None))
-    return replace(spec, fields=tuple(fields))
+
+    def make(**values: Any) -> Any:
+        try:
+            return spec.instantiate(**values)
+        except WrongValueError as error:
+            text = str(error)
+            for name in values:  # an attribute, which the option's name resembles
+                text = re.sub(rf"\b{name}\b", name.replace("_", "-"), text)
+            raise WrongValueError(text) from error
+
+    return replace(spec, fields=tuple(fields), instantiate=make)
 
 
 @RULES.primitive_rule

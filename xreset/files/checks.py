@@ -408,9 +408,8 @@ def renamed(cls: type, data: dict[str, Any]) -> dict[str, Any]:
 
 def _parsed_record(cls: type, data: Any, where: str, problems: list[str]) -> Any:
     if not isinstance(data, dict):
-        problems.append(
-            f"{where} is {shown(data)}, expected an object with the entries of {cls.__name__}."
-        )
+        names = ", ".join(_shortened([f.name for f in fields(cls)]))
+        problems.append(f"{where} is {shown(data)}, expected an object with the entries {names}.")
         return None
     count = len(problems)
     data = renamed(cls, data)
@@ -449,7 +448,7 @@ def _parsed_record(cls: type, data: Any, where: str, problems: list[str]) -> Any
     if unknown:
         found.append(f"known: {', '.join(dict.fromkeys([*nearest, *names]))}")
     if found:
-        problems.append(f"{where} does not fit {cls.__name__} ({'; '.join(found)}).")
+        problems.append(f"{where} has wrong entries ({'; '.join(found)}).")
     hints = get_type_hints(cls, include_extras=True)
     values = {
         name: _parsed_value(hints[name], data[name], f"{where}.{name}", problems)

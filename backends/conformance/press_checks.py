@@ -35,7 +35,7 @@ _TINS = 64
 
 def pressing(bench: Bench) -> Measured:
     """Press on an object on the table with a thumb, an index finger and another link; only that one must be reported,
-    and none from 1 mm above the object. Then throw tins with their rims against a capsule: it must be reported.
+    and none from 1 mm above the object. Then throw tins with their rims against a capsule: none may fly on.
 
     The drive presses with kp (q - target), and the table carries that and the object's weight.
     """
@@ -186,7 +186,7 @@ def joint_friction(bench: Bench) -> Measured:
 
 
 def _missed_rims(bench: Bench) -> Tensor:
-    """Return how many tins touch a capsule with an edge or a corner of their rim, 0.3 mm deep, and are not reported."""
+    """Return how many tins fly on unnoticed that touch a capsule with an edge or a corner of their rim, 0.3 mm deep."""
     hull = tin()
     scene = replace(bench.scene, robot=presser(thumb=("palm",)), objects=(hull,))
     object_index = [0] * _TINS
@@ -209,7 +209,10 @@ def _missed_rims(bench: Bench) -> Tensor:
     start.object_linvel[:, 0] = _PUSH
     with bench.other(scene, object_index) as worlds:
         worlds.advance(start, 1)
-        return (~worlds.contacts().tip_touch[:, 0]).float().sum()
+        touched = worlds.contacts().tip_touch[:, 0]
+        # by the end of the step, a stiff engine may have stopped the tin already, and a stopped one does not press
+        stopped = worlds.state().object_linvel[:, 0] < _PUSH / 2
+        return (~(touched | stopped)).float().sum()
 
 
 def _scene(bench: Bench, robot: RobotSpec) -> SceneSpec:

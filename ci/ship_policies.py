@@ -52,7 +52,8 @@ def halved(content: bytes) -> bytes:
 def halved_checkpoint(run: Path, network: bytes) -> bytes:
     """Return a checkpoint from which another training starts: the policy and the critic of a run's newest one.
 
-    Large weights are in half precision. Weights that the policy's file has are left out.
+    Large weights are in half precision, those of the critic with the digits of bfloat16, which take a sixth less space in
+    a wheel. Weights that the policy's file has are left out.
 
     Args:
         run: run folder.
@@ -60,10 +61,14 @@ def halved_checkpoint(run: Path, network: bytes) -> bytes:
     """
     content = read_checkpoint(latest_checkpoint(run))
     actor = halved_state(content.policy_state_dict)
+    critic = halved_state(content.critic_state_dict)
+    for name, value in critic.items():
+        if value.dtype == torch.half:
+            critic[name] = value.bfloat16().half()
     content = replace(
         content,
         actor_state_dict=actor,
-        critic_state_dict=halved_state(content.critic_state_dict),
+        critic_state_dict=critic,
         optimizer_state_dict={"state": {}},
         average_state_dict={},
         resets_state_dict={},

@@ -613,11 +613,11 @@ class TrainingTest(WithBank):
         info = read_run(self.folder / "on")
         self.assertEqual((info.weights, info.weights_hash), (str(file), file_hash(file)))
         before = newest(self.out)
-        for networks in ("actor_state_dict", "critic_state_dict"):
+        for networks, rtol in (("actor_state_dict", 1e-3), ("critic_state_dict", 4e-3)):
             for name, value in getattr(before, networks).items():
                 if "normalizer" not in name:
                     found = getattr(content, networks)[name]
-                    assert_close(found, value, rtol=1e-3, atol=1e-4, msg=name)
+                    assert_close(found, value, rtol=rtol, atol=1e-4, msg=name)
 
     def test_the_policy_has_the_running_mean_of_the_weights(self):
         self.assertFalse(newest(self.out).average_state_dict, "no mean was asked for")

@@ -44,7 +44,7 @@ class FaceTest(TestCase):
         python = "Path Callable Sequence Iterable Mapping Module Literal None Any Self"
         ours = "Data PositiveInt PositiveFloat Seed"
         of_commands = "Annotated Device Option Output Port Pose Png Rate Progress NamedProgress"
-        of_commands += " OutputFile ArchiveFile Onnx Mp4"
+        of_commands += " OutputFile ArchiveFile Onnx Mp4 EngineName RobotName"
         elsewhere = {*python.split(), *ours.split(), *of_commands.split()}
         functions = 0
         for name in xreset.__all__:

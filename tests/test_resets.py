@@ -196,10 +196,10 @@ class FilterTest(TestCase):
 
     def test_an_engine_tries_what_the_one_before_accepts(self):
         calls = []
-        options = {"engine": ("a", "b"), "progress": lambda *at: calls.append(at)}
+        options = {"engine": ("mujoco", "pybullet"), "progress": lambda *at: calls.append(at)}
         bank, tries = self.tried([[0, -1, 1, -1, -1], [-1, -1, 3]], **options)
-        self.assertEqual(bank.engines, ("a", "b"))
-        words = "states stable in a, b"
+        self.assertEqual(bank.engines, ("mujoco", "pybullet"))
+        words = "states stable in mujoco, pybullet"
         self.assertEqual(calls, [(words, 5, 10), (words, 8, 10), (words, 10, 10)])
         self.assertEqual(
             [names for names, *_ in tries], [[SOUP] * 3 + [SPAM] * 2, [SOUP, SPAM, SPAM]]

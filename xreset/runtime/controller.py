@@ -169,9 +169,7 @@ class Controller:
                 raise LiveError(
                     f"This policy needs {entry} of the object. Give an object with them, as Controller.object does."
                 )
-            self._given[name] = self._positions(
-                f"The object's {entry}", obj[entry], *self.shapes[name]
-            )
+            self._given[name] = self._positions(name, obj[entry], *self.shapes[name])
         self._set_goal(goal_pos, goal_quat)
         if _MEMORY in self.shapes:
             self._given[_MEMORY] = np.zeros((len(given), *self.shapes[_MEMORY]), np.float32)

@@ -52,3 +52,13 @@ def depth_text(depth: np.ndarray, what: str) -> str:
     """Return how deep the robot is in the object, for depths [N] of frames or states [m] and their name."""
     deep = np.mean(depth > 0.002)
     return f"in {what} the robot is at most {1e3 * depth.max():.1f} mm deep in the object ({deep:.1%} over 2 mm)"
+
+
+def write_next_to_policy(arguments: dict[str, Any], name: str | None = None) -> None:
+    """Let results go into the policy's own folder, or into one of another name beside it, if ``out`` is None."""
+    if arguments["out"] is None:
+        from xreset.eval.policy_spec import load_policy
+
+        policy = load_policy(arguments["policy"], robot=arguments["robot"])
+        arguments["policy"] = policy
+        arguments["out"] = policy.folder.with_name(name) if name else policy.folder

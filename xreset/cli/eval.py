@@ -5,21 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
+from xreset.cli._common import write_next_to_policy
 from xreset.cli._terminal import console
 from xreset.cli._verbs import verb
 from xreset.eval import verbs
 
 if TYPE_CHECKING:
     from xreset.eval.results import Evaluation
-
-
-def _write_into_default_folder(arguments: dict[str, Any]) -> None:
-    from xreset.eval.policy_spec import load_policy
-
-    if arguments["out"] is None:
-        policy = load_policy(arguments["policy"], robot=arguments["robot"])
-        arguments["policy"] = policy
-        arguments["out"] = policy.folder
 
 
 def _show(results: Evaluation, _options: Mapping[str, Any]) -> None:
@@ -31,4 +23,4 @@ def _show(results: Evaluation, _options: Mapping[str, Any]) -> None:
     console.print(f"results in {results.folder}")
 
 
-COMMAND = verb(verbs.evaluate, _show, prepare=_write_into_default_folder)
+COMMAND = verb(verbs.evaluate, _show, prepare=write_next_to_policy)

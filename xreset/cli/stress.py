@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
+from xreset.cli._common import write_next_to_policy
 from xreset.cli._terminal import console, show_table
 from xreset.cli._verbs import verb
 from xreset.eval import verbs
@@ -17,13 +18,8 @@ if TYPE_CHECKING:
 
 
 def _write_into_default_folder(arguments: dict[str, Any]) -> None:
-    if arguments["out"] is None:
-        has_faults = plays_on_robot(arguments.get("properties", ()), arguments["faults"])
-        from xreset.eval.policy_spec import load_policy
-
-        policy = load_policy(arguments["policy"], robot=arguments["robot"])
-        arguments["policy"] = policy
-        arguments["out"] = policy.folder.parent / ("faults" if has_faults else "stress")
+    has_faults = plays_on_robot(arguments.get("properties", ()), arguments["faults"])
+    write_next_to_policy(arguments, "faults" if has_faults else "stress")
 
 
 def _show(found: Evaluation, _options: Mapping[str, Any]) -> None:

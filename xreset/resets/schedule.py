@@ -34,11 +34,13 @@ def schedule(item_object: np.ndarray, max_worlds: int) -> Schedule:
 
     Args:
         item_object: [I] object index of each item.
-        max_worlds: largest number of worlds; more are used if there are more objects.
+        max_worlds: largest number of worlds. If there are more objects, each may have two: with one for each, most
+            worlds would wait for the object with the most items.
     """
     objects, counts = np.unique(item_object, return_counts=True)
     worlds = np.ones_like(counts)
-    for _ in range(min(max_worlds, len(item_object)) - len(objects)):
+    most = max_worlds if len(objects) <= max_worlds else 2 * len(objects)
+    for _ in range(min(most, len(item_object)) - len(objects)):
         worlds[np.argmax(counts / worlds)] += 1
     num_rounds = np.max(-(-counts // worlds))  # rounded up
     columns = []

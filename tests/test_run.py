@@ -96,12 +96,15 @@ class Run(InFolder, TestCase):
     def test_training_starts_from_the_policy_that_ships(self):
         on = {"weights": "many-objects", "minutes": 7.0}
         anew = {"weights": None, "minutes": 25.0}
+        own = self.folder / "mine"
+        shutil.copytree(robot_folder("openarm"), own)
         for robot, options, expected in (
             ("ur7e-sharpa", {}, on),
             ("ur7e-sharpa", {"iterations": 5}, on | {"minutes": None}),
             ("ur7e-sharpa", {"weights": "none"}, anew),
             ("ur7e-sharpa", {"recipe": "any_object"}, anew),
-            ("openarm", {}, anew),
+            ("openarm", {}, {"weights": "openarm", "minutes": 7.0}),
+            (own, {}, anew),
         ):
             with (
                 self.subTest(robot=robot, options=options),
